@@ -1,0 +1,87 @@
+"""One trained object <-> one reusable asset: NAME.usda beside NAME.safetensors.
+
+The USD file says where the weights are, what they hash to and how they were made, and carries the
+extracted mesh that other programs show; the safetensors file is the object. See ``weights.py``.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float, Int
+from numpy import ndarray
+from torch import Tensor
+
+from rfsg.objects.body import Body
+from rfsg.scene import usd
+from rfsg.scene.scene import SceneError
+from rfsg.scene.weights import digest, pack, refuse_overwrite, write_beside
+
+Mesh = tuple[
+    Float[ndarray, "v 3"] | Float[Tensor, "v 3"],
+    Int[ndarray, "t 3"] | Int[Tensor, "t 3"],
+    Float[ndarray, "v 3"] | Float[Tensor, "v 3"],
+]
+
+
+@dataclass(frozen=True)
+class LoadedAsset:
+    """An object read back: ``path`` is the asset's USD file, ``weights`` its tensors' file."""
+
+    body: Body
+    provenance: dict[str, Any]
+    path: Path
+    weights: Path
+    sha256: str
+
+
+def save_asset(
+    path: str | Path,
+    body: Body,
+    *,
+    name: str | None = None,
+    mesh: Mesh | None = None,
+    provenance: Mapping[str, Any] | None = None,
+    color: Sequence[float] = (0.55, 0.57, 0.6),
+    overwrite: bool = False,
+) -> Path:
+    """Write NAME.usda and NAME.safetensors; returns the path of the USD file.
+
+    path: NAME.usda, or the same without its ending. name: the root prim, by default the file's
+    name. mesh: vertices [m], triangles and outward unit vertex normals of the extracted surface, in
+    the object's frame, for other programs to show. provenance: anything JSON can hold (source mesh,
+    seed, report). color: linear RGB of the mesh.
+
+    Raises SceneError when a file is there and ``overwrite`` is False, when the mesh or the
+    provenance cannot be written, or the folder does not exist.
+    """
+    usda = Path(path).with_suffix(".usda")
+    weights = usda.with_suffix(".safetensors")
+    refuse_overwrite([usda, weights], overwrite)
+    data = pack(body)
+    layer = usd.asset_layer(
+        name or usda.stem,
+        weights.name,
+        digest(data),
+        body.shape,
+        mesh,
+        dict(provenance or {}),
+        color,
+    )
+    # weights first: an interruption in between leaves a hash that does not match, no mix
+    write_beside(weights, data, overwrite)
+    write_beside(usda, layer.encode(), overwrite)
+    return usda
+
+
+def load_asset(path: str | Path) -> LoadedAsset:
+    """Read an asset's USD file back: the same bits as were saved.
+
+    Raises SceneError listing every fault; the weights must lie in the asset's folder tree.
+    """
+    path = Path(path)
+    if path.suffix == ".safetensors":
+        raise SceneError([f"{path}: give the asset's USD file ({path.with_suffix('.usda').name})"])
+    found = usd.read_asset(path)
+    return LoadedAsset(found.body, found.provenance, path, Path(found.weights), found.sha256)
