@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.analytic import Box, Capsule, Cylinder, HalfSpace, Sphere
 
-
 SHAPES = [
     Box([0.3, 0.5, 0.7]),
     Sphere(0.6),

@@ -1,0 +1,162 @@
+"""The network distance: hand-written sweeps against autograd, start, precision, Lipschitz bound."""
+
+import json
+
+import pytest
+import torch
+
+from rfsg.objects.contract import Shape
+from rfsg.objects.shapes.neural import CPU_CHUNK, NeuralShape, compute_lipschitz
+
+BOUNDS = [[-0.4, -0.7, 0.0], [0.6, 0.5, 1.1]]
+
+
+def shape(seed=0, **sizes):
+    """An untrained network with its sines awake, so that all terms of the sweeps count."""
+    s = NeuralShape(BOUNDS, seed=seed, lipschitz=2.0, **sizes)
+    generator = torch.Generator().manual_seed(seed + 1)
+    with torch.no_grad():
+        for p in s.parameters():
+            p += 0.05 * torch.randn(p.shape, generator=generator)
+    return s
+
+
+def points(n=50, seed=0, dtype=torch.float64):
+    low, high = torch.tensor(BOUNDS, dtype=torch.float64)
+    g = torch.Generator().manual_seed(seed)
+    return (low + (high - low) * torch.rand(n, 3, generator=g, dtype=torch.float64)).to(dtype)
+
+
+def test_satisfies_the_contract_and_comes_back_from_its_config():
+    s = shape()
+    assert isinstance(s, Shape) and not s.convex and not s.exact
+    again = NeuralShape(**json.loads(json.dumps(s.config())))
+    again.load_state_dict(s.state_dict())
+    assert torch.equal(again.sdf(points()), s.sdf(points()))
+    assert torch.equal(again.bounds(), s.bounds()) and again.lipschitz == s.lipschitz
+    assert s.planes().shape == (0, 4)
+    with pytest.raises(NotImplementedError, match="convex"):
+        s.interval(points(), points())
+
+
+def test_it_is_the_network_of_the_paper():
+    s = NeuralShape(BOUNDS, lipschitz=2.0)
+    assert len(s.hidden) == 8 and {layer.out_features for layer in s.hidden} == {64}
+    assert s.hidden[0].in_features == 3 + 2 * 3 * 6
+    assert s.hidden[4].in_features == 64 + 39
+    assert s.feature(points()).shape == (50, 128)
+
+
+def test_gradient_agrees_with_autograd():
+    s, x = shape(), points().requires_grad_()
+    (expected,) = torch.autograd.grad(s.sdf(x).sum(), x)
+    value, gradient = s.value_and_gradient(x)
+    assert torch.equal(value, s.sdf(x))
+    assert torch.allclose(gradient, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_hessian_agrees_with_autograd_of_the_value():
+    s, x = shape(), points(8)
+    hessian = torch.stack([torch.autograd.functional.hessian(s.sdf, p) for p in x])
+    jet = s.jet(x)
+    assert torch.allclose(jet.hessian, hessian, rtol=1e-8, atol=1e-8 * hessian.abs().max())
+    assert hessian.abs().max() > 1.0
+    assert torch.equal(jet.gradient, s.value_and_gradient(x)[1])
+
+
+def test_everything_can_be_differentiated_in_points_and_weights():
+    s = shape(width=6, depth=3, skip=1, frequencies=2, features=3).double()
+    names = [n for n, _ in s.named_parameters()]
+    x = points(3).requires_grad_()
+    weights = [p.detach().clone().requires_grad_() for p in s.parameters()]
+
+    class Ask(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.s = s
+
+        def forward(self, p):
+            jet = self.s.jet(p)
+            return jet.hessian, *self.s.value_gradient_feature(p), self.s.feature(p)
+
+    def answers(p, *w):
+        state = {f"s.{n}": v for n, v in zip(names, w, strict=True)}
+        return torch.func.functional_call(Ask(), state, (p,))
+
+    assert torch.autograd.gradcheck(answers, (x, *weights), eps=1e-6, atol=1e-4, rtol=1e-4)
+
+
+def test_one_sweep_gives_the_same_as_three_questions():
+    s, x = shape(), points(7).reshape(7, 1, 3).expand(7, 2, 3)
+    value, gradient, feature = s.value_gradient_feature(x)
+    assert value.shape == (7, 2) and gradient.shape == (7, 2, 3) and feature.shape == (7, 2, 128)
+    assert torch.allclose(value, s.sdf(x)) and torch.allclose(feature, s.feature(x))
+    assert torch.allclose(gradient, s.value_and_gradient(x)[1])
+
+
+def test_chunks_change_nothing():
+    s, x = shape(), points(2 * CPU_CHUNK + 5, dtype=torch.float32)
+    whole = s.value_and_gradient(x)
+    with torch.no_grad():
+        pieces = s.value_and_gradient(x)
+    for a, b in zip(whole, pieces, strict=True):
+        assert torch.allclose(a, b, atol=1e-5)
+    assert s.sdf(points(0)).shape == (0,)
+
+
+def test_dtype_of_the_points_decides_the_precision():
+    s, x = shape(), points(200)
+    assert s.sdf(x).dtype == torch.float64 and s.sdf(x.float()).dtype == torch.float32
+    assert (s.sdf(x) - s.sdf(x.float().double())).abs().max() < 1e-5
+    difference = (s.sdf(x.float().double()) - s.sdf(x.float()).double()).abs().max()
+    assert 0 < difference < 1e-5
+    assert all(p.dtype == torch.float32 for p in s.parameters())
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_new_network_is_about_a_sphere(seed):
+    s, x = NeuralShape(BOUNDS, seed=seed, lipschitz=2.0), points(2000)
+    centre = s.bounds().mean(0)
+    reach = (s.bounds()[1] - s.bounds()[0]).max() / 2
+    away = (x - centre).norm(dim=-1)
+    value, gradient = s.value_and_gradient(x)
+    assert (value - (away - reach / 2)).abs().mean() < 0.3 * reach
+    outward = (gradient * (x - centre)).sum(-1) / away
+    assert (outward[away > 0.3 * reach] > 0.3).all()
+    assert s.sdf(centre) < 0 and (s.sdf(s.bounds()) > 0).all()
+
+
+def test_lipschitz_bound_holds_on_independent_samples():
+    s = shape(3)
+    bound = compute_lipschitz(s)
+    slope = s.value_and_gradient(points(40_000, seed=9, dtype=torch.float32))[1].norm(dim=-1)
+    assert slope.max() <= bound <= 3 * slope.max()
+    x, y = points(5000, seed=4), points(5000, seed=5)
+    y = x + 0.05 * (y - x)
+    assert ((s.sdf(x) - s.sdf(y)).abs() <= bound * (x - y).norm(dim=-1)).all()
+    assert NeuralShape(BOUNDS).lipschitz > 0.5
+
+
+def test_patch_tells_facing_and_place():
+    s = NeuralShape([[-1.0] * 3, [1.0] * 3], lipschitz=2.0)
+    x = torch.tensor([[-0.5, 0, 0], [0.5, 0, 0], [0, -0.5, 0], [0, 0.5, 0], [0, 0, -0.5]]).double()
+    code = s.patch(torch.cat([x, torch.tensor([[0, 0, 0.5]]).double()]))
+    assert (code % 6).tolist() == [0, 1, 2, 3, 4, 5]
+    assert (code // 6).tolist() == [4, 22, 10, 16, 12, 14]
+
+
+def test_normal_is_a_unit_vector_and_safe_where_there_is_none():
+    s = shape()
+    assert torch.allclose(s.normal_at(points()).norm(dim=-1), torch.ones(50).double())
+    with torch.no_grad():
+        s.to_value.weight.zero_()
+    assert torch.equal(s.normal_at(points()), torch.zeros(50, 3).double())
+
+
+FLAT = [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
+
+
+@pytest.mark.parametrize("wrong", [{"bounds": FLAT}, {"skip": 8}, {"softness": 0.0}, {"width": 0}])
+def test_what_is_not_a_network_is_refused(wrong):
+    with pytest.raises(ValueError, match="NeuralShape"):
+        NeuralShape(**({"bounds": BOUNDS} | wrong))
