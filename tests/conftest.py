@@ -51,3 +51,88 @@ def same_seed_every_time():
     import torch
 
     torch.manual_seed(0)
+
+
+@pytest.fixture
+def small_run():
+    """A result made by hand: one box, one sphere, one transmitter, two receivers.
+
+    Link 0 has line of sight and a reflection from the box; link 1 goes through the sphere; one more
+    path is blocked. Everything that draws or writes a result can be tried on it, without a tracer.
+    """
+    from types import SimpleNamespace
+
+    import torch
+
+    from rfsg.objects.body import Body
+    from rfsg.objects.shapes.analytic import Box, Sphere
+    from rfsg.objects.surfaces.interface import Conductor
+    from rfsg.scene.pose import Pose
+    from rfsg.scene.radios import Radio
+    from rfsg.scene.scene import Node, Scene
+    from rfsg.tracer.plan import Quality
+    from rfsg.tracer.records import Channel, Paths
+
+    def real(values):
+        return torch.tensor(values, dtype=torch.float64)
+
+    scene = Scene(
+        nodes=(
+            Node("/World/Wall", Body(Box((2.0, 0.1, 1.5)), Conductor()), Pose.at(2.0, 3.0, 1.5)),
+            Node("/World/Ball", Body(Sphere(0.3), Conductor()), Pose.at(2.0, -1.0, 1.0)),
+        ),
+        transmitters=(Radio.at("/World/AP", 0.0, 0.0, 1.0, power_dbm=10.0),),
+        receivers=(Radio.at("/World/rx_0", 4.0, 0.0, 1.0), Radio.at("/World/rx_1", 4.0, -2.0, 1.0)),
+        frequency=1e9,
+    )
+    tx, bounce = real([0.0, 0, 1]), real([2.0, 2.9, 1])
+    ends = [real([4.0, 0, 1]), real([4.0, 0, 1]), real([4.0, -2, 1]), real([4.0, -2, 1])]
+    rows = [[tx, r, r] for r in ends]
+    rows[1] = [tx, bounce, ends[1]]
+    vertices = torch.stack([torch.stack(row) for row in rows])
+    length = vertices.diff(dim=1).norm(dim=-1).sum(dim=1)
+    which = torch.tensor([[-1], [0], [-1], [-1]])
+    towards = vertices[:, 1] - vertices[:, 0]
+    back = vertices[torch.arange(4), torch.tensor([0, 1, 0, 0])] - torch.stack(ends)
+    paths = Paths(
+        tx=torch.zeros(4, dtype=torch.int64),
+        rx=torch.tensor([0, 0, 1, 1]),
+        which=which,
+        vertices=vertices,
+        normal=torch.zeros(4, 1, 3, dtype=torch.float64),
+        length=length,
+        spread=1 / length,
+        status=torch.zeros(4, dtype=torch.int64),
+    )
+    gain = torch.polar(0.0239 / length, real([0.0, 3.0, 0.5, 0.0]))[:, None]
+    channel = Channel(
+        tx=paths.tx,
+        rx=paths.rx,
+        frequency=real([1e9]),
+        delay=length / 299_792_458.0,
+        gain=gain,
+        doppler=real([0.0, 1.5, 0.0, 0.0]),
+        departure=towards / towards.norm(dim=-1, keepdim=True),
+        arrival=back / back.norm(dim=-1, keepdim=True),
+        crossed=torch.tensor([[2, 1], [3, 1]]),
+        blocked=torch.tensor([False, False, False, True]),
+    )
+    links = [
+        {"tx": "/World/AP", "rx": "/World/rx_0", "path_gain_db": -44.0, "rss_dbm": -34.0}
+        | {"delay_spread_ns": 4.0, "n_paths": 2, "los": True},
+        {"tx": "/World/AP", "rx": "/World/rx_1", "path_gain_db": -45.5, "rss_dbm": -35.5}
+        | {"delay_spread_ns": 0.0, "n_paths": 1, "los": False},
+    ]
+    return SimpleNamespace(
+        scene=scene,
+        paths=paths,
+        channel=channel,
+        plan=SimpleNamespace(
+            modelled=["reflection"], left_out=["diffraction: no edges asked for"], quality=Quality()
+        ),
+        status_counts={"OK": 3, "OPAQUE": 1},
+        seconds={"launch": 0.1, "solve": 0.2},
+        warnings=["a warning"],
+        links=lambda: links,
+        path_gain=lambda: real([[[4e-5], [2.8e-5]]]),
+    )

@@ -1,0 +1,78 @@
+"""rfsg: radio ray tracing with neural objects that are trained once and reused in any scene.
+
+    import rfsg
+
+    scene = rfsg.Scene.from_usd("lab.usda")
+    result = rfsg.simulate(scene, frequency=2.44e9)
+    moved = rfsg.simulate(scene.moved("/World/Cabinet", (1.2, 0, 0)), frequency=2.44e9)
+
+Conventions, everywhere:
+
+- SI units: metres, hertz, seconds, radians, watts. dB and dBm only at the edges: command line,
+  files, pictures, and fields whose names end in ``_db``, ``_dbm`` or ``_ns``.
+- World frame: right-handed, z up. Azimuth is counted from +x towards +y, elevation from the
+  horizon. A direction is a direction of travel.
+- Shapes: f < 0 inside, normals point outward.
+- Time exp(+j 2 pi f t): a path of delay tau carries exp(-j 2 pi f tau), and a permittivity is
+  eps_r - j sigma / (2 pi f eps_0).
+- h(f) = sum over paths of gain_l(f) exp(-j 2 pi f delay_l): the channel between the given
+  antennas for 1 W in. Path gain is |h|^2.
+- Positions, lengths, delays and phases are float64.
+- Parameter values change in place, as torch's optimisers do; the structure of a scene never does:
+  ``moved``, ``replaced`` and ``without`` return a new scene that shares the objects.
+
+Nothing heavy is imported until one of the names below is asked for.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rfsg.objects.body import Body as Body
+    from rfsg.scene.pose import Pose as Pose
+    from rfsg.scene.radios import Radio as Radio
+    from rfsg.scene.scene import Node as Node
+    from rfsg.scene.scene import Scene as Scene
+    from rfsg.scene.scene import SceneError as SceneError
+    from rfsg.tracer.plan import Quality as Quality
+    from rfsg.tracer.radiomap import radio_map as radio_map
+    from rfsg.tracer.simulate import Result as Result
+    from rfsg.tracer.simulate import simulate as simulate
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Body": "rfsg.objects.body",
+    "Node": "rfsg.scene.scene",
+    "Pose": "rfsg.scene.pose",
+    "Quality": "rfsg.tracer.plan",
+    "Radio": "rfsg.scene.radios",
+    "Result": "rfsg.tracer.simulate",
+    "Scene": "rfsg.scene.scene",
+    "SceneError": "rfsg.scene.scene",
+    "radio_map": "rfsg.tracer.radiomap",
+    "simulate": "rfsg.tracer.simulate",
+}
+
+__all__ = [
+    "Body",
+    "Node",
+    "Pose",
+    "Quality",
+    "Radio",
+    "Result",
+    "Scene",
+    "SceneError",
+    "radio_map",
+    "simulate",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'rfsg' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

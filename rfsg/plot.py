@@ -1,0 +1,319 @@
+"""Pictures: a scene with its paths, power-delay profiles, radio maps, measured against predicted.
+
+Figures are made without a window system and without global state; ``save`` writes them. Objects are
+drawn from their own implicit functions, so that a learned object looks as the tracer sees it.
+"""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from scipy.spatial import ConvexHull
+
+from rfsg.scene.pose import Pose
+from rfsg.scene.scene import Node, Scene
+
+MOST_PATHS = 400  # more lines than this only blacken a picture; the strongest are drawn
+DYNAMIC_RANGE_DB = 60.0  # below the strongest path; weaker ones are not drawn
+SLICES = 7  # horizontal cuts that show a curved or learned object in 3-D
+GRID = (56, 56, 28)  # samples of an implicit function across an object's bounds
+
+_OBJECT = "#5b6675"
+_GROUND = "#eceff3"
+_TX = "#c0392b"
+_RX = "#1f6fb2"
+_PATHS = "plasma"
+_MAP = "viridis"
+_BOX_EDGES = [(i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step]
+
+
+def save(figure: Figure, file: str | Path, dpi: int = 130) -> Path:
+    """Write a figure beside its place and rename it there; returns the place."""
+    file = Path(file)
+    beside = file.with_name(f".{file.stem}-partial{file.suffix}")
+    figure.savefig(beside, dpi=dpi, facecolor="white")
+    os.replace(beside, file)
+    return file
+
+
+def scene_figure(scene: Scene, paths: Any = None, channel: Any = None, title: str = "") -> Figure:
+    """The scene from above and in space; with paths and channel, its paths coloured by gain."""
+    figure = Figure(figsize=(14.0, 6.2), layout="constrained")
+    top = figure.add_subplot(1, 2, 1)
+    space = figure.add_subplot(1, 2, 2, projection="3d")
+    draw_top(top, scene)
+    _draw_space(space, scene)
+    if paths is not None and channel is not None:
+        lines, gain_db = path_lines(paths, channel)
+        if lines:
+            shade = Normalize(gain_db.min(), gain_db.max())
+            look: dict[str, Any] = {"array": gain_db, "cmap": _PATHS, "norm": shade, "alpha": 0.75}
+            flat = LineCollection([x[:, :2] for x in lines], linewidths=0.9, zorder=3, **look)
+            top.add_collection(flat)
+            space.add_collection3d(Line3DCollection(lines, linewidths=0.7, **look))
+            bar = figure.colorbar(flat, ax=[top, space], shrink=0.75, pad=0.02)
+            bar.set_label("path gain [dB]")
+    _radios(top, scene)
+    top.set_title("from above", fontsize=10)
+    figure.suptitle(title or f"{_plural(len(scene.nodes), 'object')}")
+    return figure
+
+
+def path_lines(paths: Any, channel: Any) -> tuple[list[np.ndarray], np.ndarray]:
+    """Polylines [m] of the arriving paths that a picture can carry, and their gains [dB].
+
+    Weakest first, so that the strongest lie on top.
+    """
+    power = _numpy(channel.gain)[:, 0]
+    power = np.abs(power) ** 2 * ~_numpy(channel.blocked)
+    if not (power > 0).any():
+        return [], np.zeros(0)
+    floor = power.max() * 10 ** (-DYNAMIC_RANGE_DB / 10)
+    chosen = [p for p in np.argsort(power)[-MOST_PATHS:] if power[p] > floor]
+    vertices, corners = _numpy(paths.vertices), (_numpy(paths.which) >= 0).sum(axis=1) + 2
+    return [vertices[p, : corners[p]] for p in chosen], 10 * np.log10(power[chosen])
+
+
+def delay_figure(scene: Scene, channel: Any, links: Sequence[tuple[int, int]]) -> Figure:
+    """Power-delay profiles: one panel per link (transmitter index, receiver index)."""
+    rows = max(1, len(links))
+    figure = Figure(figsize=(8.0, 1.2 + 1.9 * rows), layout="constrained")
+    panels = figure.subplots(rows, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    power, delay = np.abs(_numpy(channel.gain)[:, 0]) ** 2, 1e9 * _numpy(channel.delay)
+    heard = (power > 0) & ~_numpy(channel.blocked)
+    peak = 10 * np.log10(power[heard].max()) if heard.any() else 0.0
+    for panel, (tx, rx) in zip(panels, links, strict=False):
+        mine = heard & (_numpy(channel.tx) == tx) & (_numpy(channel.rx) == rx)
+        level = 10 * np.log10(power[mine])
+        seen = level > peak - 2 * DYNAMIC_RANGE_DB
+        bottom = peak - 2 * DYNAMIC_RANGE_DB
+        if seen.any():
+            bottom = min(level[seen].min() - 5.0, peak - 30.0)
+        panel.vlines(delay[mine][seen], bottom, level[seen], color=_RX, linewidth=1.2)
+        panel.plot(delay[mine][seen], level[seen], "o", color=_RX, markersize=3.5)
+        names = f"{_name(scene.transmitters[tx].path)} to {_name(scene.receivers[rx].path)}"
+        panel.set_title(f"{names}: {_plural(int(mine.sum()), 'path')}", fontsize=9, loc="left")
+        panel.set_ylabel("path gain [dB]")
+        panel.grid(alpha=0.3)
+    panels[-1].set_xlabel("delay [ns]")
+    return figure
+
+
+def map_figure(radio_map: Any, scene: Scene, title: str = "") -> Figure:
+    """Received power [dBm] over a plane, with the objects that stand in it."""
+    x, y = _numpy(radio_map.x), _numpy(radio_map.y)
+    level = np.asarray(_numpy(radio_map.rss_dbm()), dtype=float)
+    level = np.ma.masked_invalid(np.where(_numpy(radio_map.path_gain) > 0, level, np.nan))
+    width, depth = np.ptp(_edges(x)), np.ptp(_edges(y))
+    figure = Figure(figsize=(8.5, 1.6 + 7.0 * min(1.4, depth / width)), layout="constrained")
+    axes = figure.add_subplot()
+    known = level.compressed()
+    low, high = np.percentile(known, (1, 99.5)) if known.size else (0.0, 1.0)
+    image = axes.pcolormesh(_edges(x), _edges(y), level, cmap=_MAP, vmin=low, vmax=high)
+    axes.set_facecolor("#d8d8d8")
+    draw_top(axes, scene, fill=False, limits=False)
+    _radios(axes, scene, receivers=False)
+    axes.set(xlim=_ends(_edges(x)), ylim=_ends(_edges(y)))
+    figure.colorbar(image, ax=axes, shrink=0.85).set_label("received power [dBm]")
+    axes.set_title(title or f"received power {float(radio_map.height):g} m above the origin")
+    return figure
+
+
+def comparison_figure(
+    measured: Float[np.ndarray, "n"],
+    predicted: dict[str, Float[np.ndarray, "n"]],
+    unit: str = "dBm",
+    title: str = "",
+) -> Figure:
+    """Measured against predicted: a scatter of the first prediction, and the CDF of every error."""
+    figure = Figure(figsize=(11.0, 4.8), layout="constrained")
+    scatter, cdf = figure.subplots(1, 2)
+    for i, (name, values) in enumerate(predicted.items()):
+        error = np.sort(np.abs(values - measured))
+        share = np.arange(1, len(error) + 1) / max(1, len(error))
+        median, tail = np.percentile(error, (50, 90)) if len(error) else (np.nan, np.nan)
+        label = f"{name}: median {median:.1f} dB, 90 % {tail:.1f} dB"
+        cdf.step(error, share, where="post", label=label, color=f"C{i}")
+        if i == 0:
+            scatter.plot(measured, values, ".", markersize=3, alpha=0.35, color="C0", label=name)
+    ends = np.concatenate([measured, *list(predicted.values())[:1]])
+    if len(ends):
+        scatter.plot(_ends(ends), _ends(ends), color="black", linewidth=0.8)
+    scatter.set(xlabel=f"measured [{unit}]", ylabel=f"predicted [{unit}]", aspect="equal")
+    cdf.set(xlabel="absolute error [dB]", ylabel="share of measurements", ylim=(0, 1))
+    cdf.set_xlim(left=0)
+    for axes in (scatter, cdf):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8, loc="best")
+    figure.suptitle(title)
+    return figure
+
+
+def draw_top(axes: Axes, scene: Scene, fill: bool = True, limits: bool = True) -> None:
+    """Outlines of the objects from above [m]; flat ones (floors, ceilings) are left unfilled."""
+    low, high = scene_bounds(scene)
+    for node in scene.nodes:
+        rings = footprint(node)
+        size = np.ptp(corners(node), axis=0)
+        solid = fill and size[2] > 0.5 * min(size[0], size[1])
+        for ring in rings:
+            patch = Polygon(ring, fill=bool(solid), facecolor=_GROUND, edgecolor=_OBJECT, zorder=2)
+            axes.add_patch(patch)
+        if rings and solid and size[:2].max() < 0.4 * (high - low)[:2].max():
+            middle = np.concatenate(rings).mean(axis=0)
+            axes.annotate(_name(node.path), middle, fontsize=7, ha="center", zorder=5)
+    if limits:
+        margin = 0.04 * (high - low)[:2].max()
+        axes.set(xlim=(low[0] - margin, high[0] + margin))
+        axes.set(ylim=(low[1] - margin, high[1] + margin))
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+
+
+def footprint(node: Node) -> list[Float[np.ndarray, "_ 2"]]:
+    """Closed outlines [m] of an object seen from above; none for an unbounded one."""
+    box = corners(node)
+    if not np.isfinite(box).all():
+        return []
+    if node.body.shape.kind == "box":
+        return [box[ConvexHull(box[:, :2]).vertices, :2]]
+    frame, x, y, z, value = sampled(node)
+    rings = _contours(x, y, value.min(axis=0))
+    return [_to_world(frame, ring, 0.0)[:, :2] for ring in rings]
+
+
+def slices(node: Node) -> list[Float[np.ndarray, "_ 3"]]:
+    """Closed outlines [m] of level cuts through an object; none for an unbounded one."""
+    if not np.isfinite(corners(node)).all():
+        return []
+    frame, x, y, z, value = sampled(node)
+    levels = np.linspace(2, len(z) - 3, SLICES).round().astype(int)
+    return [_to_world(frame, ring, float(z[k])) for k in levels for ring in _contours(x, y, value[k])]
+
+
+def sampled(node: Node) -> tuple[Pose, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """A frame with z upward, coordinates x, y, z in it and the implicit function [nz, ny, nx].
+
+    The frame is the object's own where that stands upright (a thin wall that is turned keeps its
+    resolution), else the world's.
+    """
+    upright = abs(float(node.pose.rotation[2, 2])) > 1.0 - 1e-9  # rounding of a turn about z
+    frame = node.pose if upright else Pose.identity()
+    box = _numpy(frame.point_object(torch.as_tensor(corners(node))))
+    low, high = box.min(axis=0), box.max(axis=0)
+    margin = 2.0 * (high - low) / np.array(GRID)  # two cells: every outline closes in the grid
+    spans = zip(low - margin, high + margin, GRID, strict=True)
+    x, y, z = (np.linspace(a, b, n) for a, b, n in spans)
+    grid = torch.tensor(np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1], axis=-1))
+    point = node.pose.point_object(frame.point_world(grid.reshape(-1, 3))).to(_dtype(node))
+    with torch.no_grad():
+        value = torch.cat([node.body.shape.sdf(part) for part in point.split(16_384)])
+    return frame, x, y, z, _numpy(value.double()).reshape(grid.shape[:-1])
+
+
+def corners(node: Node) -> Float[np.ndarray, "8 3"]:
+    """Corners [m, world] of an object's own bounding box, x fastest; infinite if unbounded."""
+    low, high = node.body.shape.bounds().detach().double()
+    if not bool(torch.isfinite(torch.stack([low, high])).all()):
+        return np.full((8, 3), np.inf)
+    pick = torch.tensor([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], device=low.device)
+    return _numpy(node.pose.point_world(torch.where(pick.bool(), high, low)))
+
+
+def scene_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner [m] of all bounded objects and radios; a metre cube if empty."""
+    points = [box for box in map(corners, scene.nodes) if np.isfinite(box).all()]
+    points += [_numpy(r.position)[None] for r in (*scene.transmitters, *scene.receivers)]
+    if not points:
+        return np.zeros(3), np.ones(3)
+    every = np.concatenate(points)
+    return every.min(axis=0), every.max(axis=0)
+
+
+def _draw_space(axes: Any, scene: Scene) -> None:
+    low, high = scene_bounds(scene)
+    edges = []
+    for node in scene.nodes:
+        box = corners(node)
+        if node.body.shape.kind == "box":
+            edges += [box[list(pair)] for pair in _BOX_EDGES]
+        else:
+            edges += slices(node)
+    edges = [edge for edge in edges if np.isfinite(edge).all()]
+    if edges:
+        axes.add_collection3d(Line3DCollection(edges, colors=_OBJECT, linewidths=0.6, alpha=0.8))
+    size = np.maximum(high - low, 0.1 * (high - low).max() + 1e-3)
+    for radios, colour, mark in ((scene.transmitters, _TX, "^"), (scene.receivers, _RX, ".")):
+        if radios:
+            place = np.stack([_numpy(radio.position) for radio in radios])
+            axes.plot(*place.T, mark, color=colour, markersize=7)
+    axes.set(xlim=(low[0], low[0] + size[0]), ylim=(low[1], low[1] + size[1]))
+    axes.set(zlim=(low[2], low[2] + size[2]))
+    axes.set_box_aspect(size)
+    axes.view_init(elev=38, azim=-62)
+    axes.grid(False)
+    axes.tick_params(labelsize=7)
+    axes.set_xlabel("x [m]", fontsize=8)
+    axes.set_ylabel("y [m]", fontsize=8)
+    axes.set_zlabel("z [m]", fontsize=8)
+
+
+def _radios(axes: Axes, scene: Scene, receivers: bool = True) -> None:
+    groups = [(scene.transmitters, _TX, "^", 9.0, "transmitter")]
+    if receivers:
+        groups.append((scene.receivers, _RX, "o", 4.0, "receiver"))
+    for radios, colour, mark, size, label in groups:
+        if radios:
+            place = np.stack([_numpy(radio.position) for radio in radios])
+            style = {"color": colour, "markersize": size, "markeredgecolor": "white"}
+            axes.plot(place[:, 0], place[:, 1], mark, zorder=6, label=label, **style)
+    if any(group[0] for group in groups):
+        axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+
+
+def _contours(x: np.ndarray, y: np.ndarray, value: np.ndarray) -> list[np.ndarray]:
+    """Zero lines of samples [ny, nx]."""
+    axes = Figure().add_subplot()
+    rings = axes.contour(x, y, value, levels=[0.0]).allsegs[0] if (value < 0).any() else []
+    return [ring for ring in rings if len(ring) > 2]
+
+
+def _to_world(frame: Pose, ring: np.ndarray, z: float) -> np.ndarray:
+    flat = np.column_stack([ring, np.full(len(ring), z)])
+    return _numpy(frame.point_world(torch.tensor(flat)))
+
+
+def _dtype(node: Node) -> torch.dtype:
+    """A network answers fast in its own precision; closed forms cost nothing in float64."""
+    return torch.float64 if node.body.shape.exact else torch.float32
+
+
+def _edges(centre: np.ndarray) -> np.ndarray:
+    """Edges of cells with these centres; a single cell is a metre wide."""
+    step = centre[1] - centre[0] if len(centre) > 1 else 1.0
+    return np.concatenate([centre - step / 2, centre[-1:] + step / 2])
+
+
+def _ends(values: np.ndarray) -> tuple[float, float]:
+    return float(np.min(values)), float(np.max(values))
+
+
+def _name(path: str) -> str:
+    return path.rsplit("/", 1)[-1]
+
+
+def _plural(count: int, word: str) -> str:
+    return f"{count} {word}" if count == 1 else f"{count} {word}s"
+
+
+def _numpy(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)

@@ -1,0 +1,308 @@
+"""The files of a run: links, paths, channel, map and report; and the table of what a scene holds.
+
+Everything is written beside its final place and then renamed: a run that fails leaves nothing
+half-written behind, and nothing that is there is replaced unless it is asked for.
+"""
+
+import csv
+import json
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from rfsg.scene.scene import Scene
+
+LINK_COLUMNS = (
+    "tx",
+    "rx",
+    "path_gain_db",
+    "rss_dbm",
+    "delay_spread_ns",
+    "n_paths",
+    "los",
+)
+PATH_COLUMNS = (
+    "tx",
+    "rx",
+    "delay_ns",
+    "gain_db",
+    "phase_rad",
+    "doppler_hz",
+    "aod_azimuth_deg",
+    "aod_elevation_deg",
+    "aoa_azimuth_deg",
+    "aoa_elevation_deg",
+    "interactions",
+    "vertices",
+)
+_PACKAGES = ("rfsg", "torch", "numpy", "scipy", "embreex", "usd-core", "manifold3d", "trimesh")
+
+
+class OutputExists(Exception):
+    """The place to write to is taken, and overwriting was not asked for."""
+
+
+def refuse_taken(out: Path, overwrite: bool) -> None:
+    """Raise OutputExists if ``out`` is a file, or a folder with something in it."""
+    if overwrite and not (out.exists() and not out.is_dir()):
+        return
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        kind = "is not empty" if out.is_dir() else "is a file, not a folder"
+        raise OutputExists(f"{out}: {kind}; choose another place, or say --overwrite")
+
+
+@contextmanager
+def output_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to write into that becomes ``out`` when all went well, and vanishes otherwise.
+
+    With ``overwrite``, files of the same names are replaced one by one; others stay.
+    Raises OutputExists as ``refuse_taken`` does.
+    """
+    refuse_taken(out, overwrite)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    try:
+        yield beside
+        out.mkdir(exist_ok=True)
+        for file in sorted(beside.iterdir()):
+            os.replace(file, out / file.name)
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
+
+
+def write_links(result: Any, file: Path) -> None:
+    """links.csv: one row per transmitter and receiver; cells without a finite value stay empty."""
+    _write_table(file, LINK_COLUMNS, result.links())
+
+
+def write_paths(result: Any, file: Path) -> None:
+    """paths.csv: one row per arriving path, link by link, strongest first, at the first frequency.
+
+    ``phase_rad`` is that of gain * exp(-j 2 pi f delay), in (-pi, pi]. Angles are in the world:
+    departure along the travel from the transmitter, arrival from the receiver back to the wave.
+    ``interactions`` lists reflections in order, then penetrations. ``vertices`` is "x y z; x y z".
+    """
+    _write_table(file, PATH_COLUMNS, path_rows(result))
+
+
+def path_rows(result: Any) -> list[dict[str, Any]]:
+    """The rows of paths.csv; see ``write_paths``."""
+    scene, paths, channel = result.scene, result.paths, result.channel
+    gain, delay, frequency = (_numpy(x) for x in (channel.gain, channel.delay, channel.frequency))
+    doppler, which, vertices = (_numpy(x) for x in (channel.doppler, paths.which, paths.vertices))
+    tx, rx = _numpy(channel.tx), _numpy(channel.rx)
+    leave, arrive = angles_deg(_numpy(channel.departure)), angles_deg(_numpy(channel.arrival))
+    through = _crossed_by_path(channel)
+    rows = []
+    for p in arriving(channel):
+        solid = [int(i) for i in which[p] if i >= 0]
+        corners = vertices[p][: len(solid) + 2]
+        # Whole turns are dropped before the angle is formed: f tau may count millions of them.
+        phase = np.angle(gain[p, 0] * np.exp(-2j * np.pi * np.mod(frequency[0] * delay[p], 1.0)))
+        rows.append(
+            {
+                "tx": scene.transmitters[tx[p]].path,
+                "rx": scene.receivers[rx[p]].path,
+                "delay_ns": 1e9 * delay[p],
+                "gain_db": 20 * np.log10(abs(gain[p, 0])),
+                "phase_rad": phase,
+                "doppler_hz": doppler[p],
+                "aod_azimuth_deg": leave[p, 0],
+                "aod_elevation_deg": leave[p, 1],
+                "aoa_azimuth_deg": arrive[p, 0],
+                "aoa_elevation_deg": arrive[p, 1],
+                "interactions": _interactions(scene, solid, through.get(int(p), [])),
+                "vertices": "; ".join(" ".join(f"{x:.6f}" for x in corner) for corner in corners),
+            }
+        )
+    return rows
+
+
+def arriving(channel: Any) -> np.ndarray:
+    """Indices of the paths that carry power, link by link, strongest first."""
+    power = np.abs(_numpy(channel.gain)[:, 0]) ** 2
+    tx, rx = _numpy(channel.tx), _numpy(channel.rx)
+    order = np.lexsort((-power, rx, tx))
+    return order[(power[order] > 0) & ~_numpy(channel.blocked)[order]]
+
+
+def angles_deg(direction: np.ndarray) -> np.ndarray:
+    """Azimuth and elevation [deg] of unit vectors [n, 3]: [n, 2]."""
+    x, y, z = direction.T
+    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+    return np.degrees(np.stack([azimuth, elevation], axis=-1))
+
+
+def write_channel(result: Any, file: Path) -> None:
+    """channel.npz: the whole channel and its paths as arrays; ``np.load`` needs no pickle.
+
+    gain [p, f] complex, delay [p] s, frequency [f] Hz, doppler [p] Hz, departure and arrival
+    [p, 3], tx and rx [p] into tx_paths and rx_paths, which [p, d] and crossed [x, 2] into
+    node_paths (-1 pads), vertices [p, d+2, 3] m, status [p], path_gain [tx, rx, f] linear.
+    """
+    scene, channel, paths = result.scene, result.channel, result.paths
+    names = ("tx", "rx", "frequency", "delay", "gain", "doppler", "departure", "arrival")
+    arrays: dict[str, Any] = {
+        name: _numpy(getattr(channel, name)) for name in (*names, "crossed", "blocked")
+    }
+    arrays |= {name: _numpy(getattr(paths, name)) for name in ("which", "vertices", "status")}
+    arrays |= {
+        "path_gain": _numpy(result.path_gain()),
+        "tx_paths": np.array([radio.path for radio in scene.transmitters], dtype=str),
+        "rx_paths": np.array([radio.path for radio in scene.receivers], dtype=str),
+        "node_paths": np.array([node.path for node in scene.nodes], dtype=str),
+    }
+    np.savez_compressed(file, **arrays)
+
+
+def write_map(radio_map: Any, file: Path) -> None:
+    """map.npz: x [nx] and y [ny] in m, height, path_gain [ny, nx] linear, error_db, rss_dbm."""
+    np.savez_compressed(
+        file,
+        x=_numpy(radio_map.x),
+        y=_numpy(radio_map.y),
+        height=float(radio_map.height),
+        path_gain=_numpy(radio_map.path_gain),
+        error_db=_numpy(radio_map.error_db),
+        rss_dbm=_numpy(radio_map.rss_dbm()),
+    )
+
+
+def write_json(facts: dict[str, Any], file: Path) -> None:
+    """A dictionary as readable JSON; numbers that JSON does not know become null."""
+    text = json.dumps(_plain(facts), indent=2, ensure_ascii=False, allow_nan=False)
+    file.write_text(text + "\n", encoding="utf-8")
+
+
+def report(result: Any, **facts: Any) -> dict[str, Any]:
+    """What report.json holds: what was asked, modelled, left out, counted and timed."""
+    from rfsg.tracer.records import Status
+
+    sentences = {status.name: status.sentence for status in Status}
+    return facts | {
+        "quality": _plain(result.plan.quality),
+        "frequency_hz": _numpy(result.channel.frequency).tolist(),
+        "modelled": list(result.plan.modelled),
+        "left_out": list(result.plan.left_out),
+        "objects": len(result.scene.nodes),
+        "transmitters": len(result.scene.transmitters),
+        "receivers": len(result.scene.receivers),
+        "paths": int(len(arriving(result.channel))),
+        "status_counts": dict(result.status_counts),
+        "status_meaning": {k: sentences[k] for k in result.status_counts if k in sentences},
+        "seconds": dict(result.seconds),
+        "warnings": [*result.scene.warnings, *result.warnings],
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide the numbers."""
+    found = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def scene_table(scene: "Scene") -> list[dict[str, Any]]:
+    """One row per object: its kinds, how many numbers they hold, its size and place [m]."""
+    return [_node_row(node) for node in scene.nodes]
+
+
+def parameter_table(scene: "Scene") -> list[dict[str, Any]]:
+    """One row per parameter tensor that a fit may change; objects of one asset share theirs."""
+    return [
+        {
+            "path": f"{node.path}.{name}",
+            "shape": " x ".join(map(str, tensor.shape)) or "scalar",
+            "value": f"{float(tensor):.4g}" if tensor.numel() == 1 else "",
+        }
+        for node in scene.nodes
+        for name, tensor in node.body.named_parameters()
+    ]
+
+
+def _node_row(node: Any) -> dict[str, Any]:
+    shape, surface = node.body.shape, node.body.surface
+    low, high = _numpy(shape.bounds()) * float(node.pose.scale)
+    config = surface.config() if hasattr(surface, "config") else {}
+    return {
+        "path": node.path,
+        "shape": shape.kind,
+        "surface": surface.kind,
+        "parameters": f"{_count(shape)} + {_count(surface)}",
+        "size [m]": " x ".join(f"{x:.3g}" for x in high - low),
+        "at [m]": " ".join(f"{x:.3g}" for x in _numpy(node.pose.translation)),
+        "settings": " ".join(f"{k}={_short(v)}" for k, v in config.items() if v is not None),
+    }
+
+
+def _count(module: Any) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value).replace(" ", "")
+
+
+def _interactions(scene: "Scene", reflected: list[int], crossed: list[int]) -> str:
+    words = [f"reflection({scene.nodes[i].path})" for i in reflected]
+    words += [f"penetration({scene.nodes[i].path})" for i in crossed]
+    return " ".join(words) or "line_of_sight"
+
+
+def _crossed_by_path(channel: Any) -> dict[int, list[int]]:
+    through: dict[int, list[int]] = {}
+    for path, node in _numpy(channel.crossed).tolist():
+        through.setdefault(path, []).append(node)
+    return through
+
+
+def _write_table(file: Path, columns: tuple[str, ...], rows: list[dict[str, Any]]) -> None:
+    with open(file, "w", newline="", encoding="utf-8") as stream:
+        table = csv.DictWriter(stream, columns, extrasaction="ignore", lineterminator="\n")
+        table.writeheader()
+        for row in rows:
+            table.writerow({name: _cell(row[name]) for name in columns})
+
+
+def _cell(value: Any) -> Any:
+    """Numbers to nine digits (a delay to femtoseconds); what is not finite stays empty."""
+    if isinstance(value, bool | np.bool_):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return f"{float(value):.9g}" if np.isfinite(value) else ""
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Anything of ours as JSON knows it."""
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: _plain(getattr(value, name)) for name in value.__dataclass_fields__}
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    if value is None or isinstance(value, str | int | bool):
+        return value
+    return str(value)
+
+
+def _numpy(value: Any) -> np.ndarray:
+    return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)

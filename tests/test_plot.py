@@ -1,0 +1,96 @@
+"""Pictures: what is drawn lies where the objects are, and every figure can be made and saved."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rfsg import plot
+from rfsg.objects.body import Body
+from rfsg.objects.shapes.analytic import Box, Cylinder, HalfSpace, Sphere
+from rfsg.objects.surfaces.interface import Conductor
+from rfsg.scene.pose import Pose
+from rfsg.scene.scene import Node, Scene
+
+
+def node(shape, pose=None, path="/World/Thing"):
+    return Node(path, Body(shape, Conductor()), pose or Pose.identity())
+
+
+def area(ring):
+    x, y = ring.T
+    return 0.5 * abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))
+
+
+def test_footprint_of_a_sphere_is_its_circle():
+    (ring,) = plot.footprint(node(Sphere(0.5), Pose.at(3.0, -2.0, 1.0, scale=2.0)))
+    radius = np.linalg.norm(ring - [3.0, -2.0], axis=1)
+    assert radius == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 30.0, 90.0])
+def test_footprint_of_a_turned_box_keeps_its_area(yaw):
+    (ring,) = plot.footprint(node(Box((2.0, 0.01, 1.0)), Pose.at(1.0, 1.0, 0.0, yaw)))
+    assert area(ring) == pytest.approx(4.0 * 0.02, rel=1e-9)
+
+
+def test_slices_lie_on_the_surface():
+    turned = node(Cylinder(0.2, 0.6), Pose.at(0.0, 5.0, 2.0, 45.0))
+    rings = plot.slices(turned)
+    assert len(rings) == plot.SLICES
+    for ring in rings:
+        assert np.hypot(ring[:, 0], ring[:, 1] - 5.0) == pytest.approx(0.2, abs=0.005)
+        assert 1.4 < ring[0, 2] < 2.6
+
+
+def test_a_tilted_object_is_seen_from_above():
+    upright = Pose.identity()
+    lying = Pose(upright.rotation[[2, 0, 1]], upright.translation, upright.scale)
+    (ring,) = plot.footprint(node(Cylinder(0.2, 1.0), lying))
+    assert sorted(np.ptp(ring, axis=0)) == pytest.approx([0.4, 2.0], abs=0.03)
+
+
+def test_an_unbounded_object_is_left_out():
+    ground = node(HalfSpace())
+    assert plot.footprint(ground) == [] and plot.slices(ground) == []
+    low, high = plot.scene_bounds(Scene(nodes=(ground,)))
+    assert np.isfinite([low, high]).all()
+
+
+def test_path_lines_drop_the_padding_and_the_blocked(small_run):
+    lines, gain_db = plot.path_lines(small_run.paths, small_run.channel)
+    assert sorted(len(line) for line in lines) == [2, 2, 3]
+    assert list(gain_db) == sorted(gain_db)
+    assert gain_db[-1] == pytest.approx(20 * np.log10(0.0239 / 4.0))
+
+
+def test_figures_are_saved_as_pictures(small_run, tmp_path):
+    scene = small_run.scene
+    rss = np.linspace(-80.0, -40.0, 30).reshape(5, 6)
+    radio_map = SimpleNamespace(
+        x=np.arange(6.0), y=np.arange(5.0), height=1.2, rss_dbm=lambda: rss,
+        path_gain=np.where(rss > -79.0, 10 ** (rss / 10), 0.0),
+    )  # fmt: skip
+    measured = np.linspace(-90.0, -40.0, 50)
+    figures = {
+        "run": plot.scene_figure(scene, small_run.paths, small_run.channel),
+        "scene": plot.scene_figure(scene),
+        "empty": plot.scene_figure(Scene()),
+        "delay": plot.delay_figure(scene, small_run.channel, [(0, 0), (0, 1)]),
+        "silence": plot.delay_figure(scene, small_run.channel, []),
+        "map": plot.map_figure(radio_map, scene),
+        "compared": plot.comparison_figure(measured, {"rfsg": measured + 1.0}),
+    }
+    for name, figure in figures.items():
+        file = plot.save(figure, tmp_path / f"{name}.png", dpi=40)
+        assert file.read_bytes().startswith(b"\x89PNG")
+    assert len(list(tmp_path.iterdir())) == len(figures)
+
+
+def test_the_delay_profile_shows_each_arriving_path_once(small_run):
+    figure = plot.delay_figure(small_run.scene, small_run.channel, [(0, 0), (0, 1)])
+    first, second = figure.axes
+    delays = np.sort(first.lines[0].get_xdata())
+    lengths = [4.0, 2 * np.hypot(2.0, 2.9)]
+    assert delays == pytest.approx([1e9 * length / 299_792_458.0 for length in lengths])
+    assert len(second.lines[0].get_xdata()) == 1
