@@ -194,7 +194,7 @@ def simulate(
         report.write_json(report.report(result, **asked), folder / "report.json")
         _draw_run(edited, result, chosen, folder, title=scene.name)
     _print_links(result)
-    for warning in (*edited.warnings, *result.warnings):
+    for warning in result.warnings:
         _note(warning)
     _print_files(out, ("links.csv", "paths.csv", "channel.npz", "report.json"))
     _print_files(out, ("scene.png", "pdp.png"))
@@ -234,7 +234,7 @@ def map_(
     from rfsg.tracer import radiomap
 
     with _bar() as progress:
-        progress("radio map", 0.0, 1.0)
+        progress("radio map")
         found = radiomap.radio_map(
             edited,
             frequency,
@@ -514,7 +514,10 @@ def _short(value: Any) -> str:
 
 @contextmanager
 def _bar() -> Iterator[Callable[..., None]]:
-    """progress(stage, done, total) as bars on stderr, one a stage; quiet when piped."""
+    """progress(stage) or progress(stage, done, total) as bars on stderr; quiet when piped.
+
+    A stage without counts is over when the next one begins.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -523,9 +526,17 @@ def _bar() -> Iterator[Callable[..., None]]:
     tasks: dict[str, Any] = {}
     with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
 
-        def progress(stage: str, done: float = 0.0, total: float = 1.0) -> None:
+        def progress(stage: str, done: float | None = None, total: float | None = None) -> None:
             if stage not in tasks:
+                _finish(bars)
                 tasks[stage] = bars.add_task(stage, total=total)
-            bars.update(tasks[stage], completed=done, total=total)
+            if done is not None:
+                bars.update(tasks[stage], completed=done, total=total)
 
         yield progress
+        _finish(bars)
+
+
+def _finish(bars: Any) -> None:
+    for task in bars.tasks:
+        bars.update(task.id, completed=task.total or 1, total=task.total or 1)

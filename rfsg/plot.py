@@ -13,26 +13,29 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
+from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Line3DCollection
 from scipy.spatial import ConvexHull
 
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 
-MOST_PATHS = 400  # more lines than this only blacken a picture; the strongest are drawn
-DYNAMIC_RANGE_DB = 60.0  # below the strongest path; weaker ones are not drawn
+MOST_PATHS = 300  # more lines than this only blacken a picture; the strongest are drawn
+DYNAMIC_RANGE_DB = 45.0  # below the strongest path; weaker ones are not drawn
 SLICES = 7  # horizontal cuts that show a curved or learned object in 3-D
 GRID = (56, 56, 28)  # samples of an implicit function across an object's bounds
 
-_OBJECT = "#5b6675"
-_GROUND = "#eceff3"
+_EDGE = "#2f3b4a"
+_WALL = "#e6e9ee"
+_THING = "#c3ccd8"
 _TX = "#c0392b"
 _RX = "#1f6fb2"
-_PATHS = "plasma"
+_PATHS = "plasma_r"
 _MAP = "viridis"
 _BOX_EDGES = [(i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step]
 
@@ -56,15 +59,16 @@ def scene_figure(scene: Scene, paths: Any = None, channel: Any = None, title: st
     if paths is not None and channel is not None:
         lines, gain_db = path_lines(paths, channel)
         if lines:
-            shade = Normalize(gain_db.min(), gain_db.max())
-            look: dict[str, Any] = {"array": gain_db, "cmap": _PATHS, "norm": shade, "alpha": 0.75}
-            flat = LineCollection([x[:, :2] for x in lines], linewidths=0.9, zorder=3, **look)
+            strength = 1.0 + (gain_db - gain_db.max()) / DYNAMIC_RANGE_DB
+            look: dict[str, Any] = {"array": gain_db, "cmap": _PATHS}
+            look |= {"linewidths": 0.3 + 1.2 * strength**2, "alpha": 0.25 + 0.7 * strength}
+            flat = LineCollection([line[:, :2] for line in lines], zorder=3, **look)
             top.add_collection(flat)
-            space.add_collection3d(Line3DCollection(lines, linewidths=0.7, **look))
-            bar = figure.colorbar(flat, ax=[top, space], shrink=0.75, pad=0.02)
-            bar.set_label("path gain [dB]")
+            space.add_collection3d(Line3DCollection(lines, **look))
+            scale = ScalarMappable(Normalize(gain_db.min(), gain_db.max()), _PATHS)
+            bar = figure.colorbar(scale, ax=[top, space], shrink=0.75, pad=0.02)
+            bar.set_label(f"path gain [dB], the {len(lines)} strongest")
     _radios(top, scene)
-    top.set_title("from above", fontsize=10)
     figure.suptitle(title or f"{_plural(len(scene.nodes), 'object')}")
     return figure
 
@@ -121,11 +125,15 @@ def map_figure(radio_map: Any, scene: Scene, title: str = "") -> Figure:
     low, high = np.percentile(known, (1, 99.5)) if known.size else (0.0, 1.0)
     image = axes.pcolormesh(_edges(x), _edges(y), level, cmap=_MAP, vmin=low, vmax=high)
     axes.set_facecolor("#d8d8d8")
-    draw_top(axes, scene, fill=False, limits=False)
+    for ring in (ring for node in scene.nodes for ring in footprint(node)):
+        halo = [withStroke(linewidth=2.2, foreground="black", alpha=0.5)]
+        axes.add_patch(Polygon(ring, fill=False, edgecolor="white", path_effects=halo))
     _radios(axes, scene, receivers=False)
     axes.set(xlim=_ends(_edges(x)), ylim=_ends(_edges(y)))
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     figure.colorbar(image, ax=axes, shrink=0.85).set_label("received power [dBm]")
-    axes.set_title(title or f"received power {float(radio_map.height):g} m above the origin")
+    text = title or f"received power at z = {float(radio_map.height):g} m"
+    axes.set_title(text, loc="right", fontsize=11)
     return figure
 
 
@@ -159,23 +167,28 @@ def comparison_figure(
     return figure
 
 
-def draw_top(axes: Axes, scene: Scene, fill: bool = True, limits: bool = True) -> None:
-    """Outlines of the objects from above [m]; flat ones (floors, ceilings) are left unfilled."""
+def draw_top(axes: Axes, scene: Scene) -> None:
+    """Outlines of the objects from above [m], named where they are small; sets the limits.
+
+    Flat ones (floors, ceilings) are left unfilled: they would hide what stands on them.
+    """
     low, high = scene_bounds(scene)
     for node in scene.nodes:
         rings = footprint(node)
         size = np.ptp(corners(node), axis=0)
-        solid = fill and size[2] > 0.5 * min(size[0], size[1])
+        solid = size[2] > 0.5 * min(size[0], size[1])
+        small = size[:2].max() < 0.4 * (high - low)[:2].max()
         for ring in rings:
-            patch = Polygon(ring, fill=bool(solid), facecolor=_GROUND, edgecolor=_OBJECT, zorder=2)
+            patch = Polygon(ring, fill=bool(solid), facecolor=_THING if small else _WALL)
+            patch.set(edgecolor=_EDGE, linewidth=1.0, zorder=2)
             axes.add_patch(patch)
-        if rings and solid and size[:2].max() < 0.4 * (high - low)[:2].max():
+        if rings and solid and small:
             middle = np.concatenate(rings).mean(axis=0)
-            axes.annotate(_name(node.path), middle, fontsize=7, ha="center", zorder=5)
-    if limits:
-        margin = 0.04 * (high - low)[:2].max()
-        axes.set(xlim=(low[0] - margin, high[0] + margin))
-        axes.set(ylim=(low[1] - margin, high[1] + margin))
+            label = axes.annotate(_name(node.path), middle, ha="center", va="center", zorder=5)
+            label.set(fontsize=8, path_effects=[withStroke(linewidth=2.5, foreground="white")])
+    margin = 0.04 * (high - low)[:2].max()
+    axes.set(xlim=(low[0] - margin, high[0] + margin))
+    axes.set(ylim=(low[1] - margin, high[1] + margin))
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
 
 
@@ -197,7 +210,9 @@ def slices(node: Node) -> list[Float[np.ndarray, "_ 3"]]:
         return []
     frame, x, y, z, value = sampled(node)
     levels = np.linspace(2, len(z) - 3, SLICES).round().astype(int)
-    return [_to_world(frame, ring, float(z[k])) for k in levels for ring in _contours(x, y, value[k])]
+    return [
+        _to_world(frame, ring, float(z[k])) for k in levels for ring in _contours(x, y, value[k])
+    ]
 
 
 def sampled(node: Node) -> tuple[Pose, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -241,16 +256,14 @@ def scene_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw_space(axes: Any, scene: Scene) -> None:
     low, high = scene_bounds(scene)
-    edges = []
     for node in scene.nodes:
         box = corners(node)
-        if node.body.shape.kind == "box":
-            edges += [box[list(pair)] for pair in _BOX_EDGES]
-        else:
-            edges += slices(node)
-    edges = [edge for edge in edges if np.isfinite(edge).all()]
-    if edges:
-        axes.add_collection3d(Line3DCollection(edges, colors=_OBJECT, linewidths=0.6, alpha=0.8))
+        boxy = node.body.shape.kind == "box"
+        edges = [box[list(pair)] for pair in _BOX_EDGES] if boxy else slices(node)
+        large = np.ptp(box, axis=0).max() > 0.4 * (high - low).max()
+        look: dict[str, Any] = {"linewidths": 0.5 if large else 0.9, "alpha": 0.5 if large else 1.0}
+        if edges:
+            axes.add_collection3d(Line3DCollection(edges, colors=_EDGE, **look))
     size = np.maximum(high - low, 0.1 * (high - low).max() + 1e-3)
     for radios, colour, mark in ((scene.transmitters, _TX, "^"), (scene.receivers, _RX, ".")):
         if radios:
@@ -261,6 +274,7 @@ def _draw_space(axes: Any, scene: Scene) -> None:
     axes.set_box_aspect(size)
     axes.view_init(elev=38, azim=-62)
     axes.grid(False)
+    axes.locator_params(axis="z", nbins=3)
     axes.tick_params(labelsize=7)
     axes.set_xlabel("x [m]", fontsize=8)
     axes.set_ylabel("y [m]", fontsize=8)
@@ -277,7 +291,8 @@ def _radios(axes: Axes, scene: Scene, receivers: bool = True) -> None:
             style = {"color": colour, "markersize": size, "markeredgecolor": "white"}
             axes.plot(place[:, 0], place[:, 1], mark, zorder=6, label=label, **style)
     if any(group[0] for group in groups):
-        axes.legend(fontsize=7, loc="upper right", framealpha=0.9)
+        place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}
+        axes.legend(fontsize=8, ncols=2, frameon=False, borderaxespad=0.2, **place)
 
 
 def _contours(x: np.ndarray, y: np.ndarray, value: np.ndarray) -> list[np.ndarray]:

@@ -96,9 +96,12 @@ def write_paths(result: Any, file: Path) -> None:
 
 def path_rows(result: Any) -> list[dict[str, Any]]:
     """The rows of paths.csv; see ``write_paths``."""
+    from rfsg.tracer.channel import coefficients
+
     scene, paths, channel = result.scene, result.paths, result.channel
-    gain, delay, frequency = (_numpy(x) for x in (channel.gain, channel.delay, channel.frequency))
-    doppler, which, vertices = (_numpy(x) for x in (channel.doppler, paths.which, paths.vertices))
+    gain, delay, doppler = (_numpy(x) for x in (channel.gain, channel.delay, channel.doppler))
+    which, vertices = _numpy(paths.which), _numpy(paths.vertices)
+    phase = np.angle(_numpy(coefficients(channel))[:, 0])
     tx, rx = _numpy(channel.tx), _numpy(channel.rx)
     leave, arrive = angles_deg(_numpy(channel.departure)), angles_deg(_numpy(channel.arrival))
     through = _crossed_by_path(channel)
@@ -106,15 +109,13 @@ def path_rows(result: Any) -> list[dict[str, Any]]:
     for p in arriving(channel):
         solid = [int(i) for i in which[p] if i >= 0]
         corners = vertices[p][: len(solid) + 2]
-        # Whole turns are dropped before the angle is formed: f tau may count millions of them.
-        phase = np.angle(gain[p, 0] * np.exp(-2j * np.pi * np.mod(frequency[0] * delay[p], 1.0)))
         rows.append(
             {
                 "tx": scene.transmitters[tx[p]].path,
                 "rx": scene.receivers[rx[p]].path,
                 "delay_ns": 1e9 * delay[p],
                 "gain_db": 20 * np.log10(abs(gain[p, 0])),
-                "phase_rad": phase,
+                "phase_rad": phase[p],
                 "doppler_hz": doppler[p],
                 "aod_azimuth_deg": leave[p, 0],
                 "aod_elevation_deg": leave[p, 1],
@@ -199,8 +200,9 @@ def report(result: Any, **facts: Any) -> dict[str, Any]:
         "paths": int(len(arriving(result.channel))),
         "status_counts": dict(result.status_counts),
         "status_meaning": {k: sentences[k] for k in result.status_counts if k in sentences},
+        "search": result.search,
         "seconds": dict(result.seconds),
-        "warnings": [*result.scene.warnings, *result.warnings],
+        "warnings": list(result.warnings),
         "versions": versions(),
     }
 

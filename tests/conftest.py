@@ -70,7 +70,8 @@ def small_run():
     from rfsg.scene.pose import Pose
     from rfsg.scene.radios import Radio
     from rfsg.scene.scene import Node, Scene
-    from rfsg.tracer.plan import Quality
+    from rfsg.tracer.launch import SearchReport
+    from rfsg.tracer.plan import Plan, Quality
     from rfsg.tracer.records import Channel, Paths
 
     def real(values):
@@ -127,11 +128,10 @@ def small_run():
         scene=scene,
         paths=paths,
         channel=channel,
-        plan=SimpleNamespace(
-            modelled=["reflection"], left_out=["diffraction: no edges asked for"], quality=Quality()
-        ),
+        plan=Plan(Quality(), ("reflection",), ("diffraction: no edges asked for",)),
         status_counts={"OK": 3, "OPAQUE": 1},
-        seconds={"launch": 0.1, "solve": 0.2},
+        search=SearchReport(rays=100),
+        seconds={"search": 0.1, "solve": 0.2},
         warnings=["a warning"],
         links=lambda: links,
         path_gain=lambda: real([[[4e-5], [2.8e-5]]]),

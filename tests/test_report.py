@@ -1,0 +1,118 @@
+"""The files of a run: what they say agrees with the records they were written from."""
+
+import csv
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rfsg import report
+
+SPEED_OF_LIGHT = 299_792_458.0
+
+
+def read(file):
+    with open(file, newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_paths_are_the_arriving_ones_strongest_first(small_run, tmp_path):
+    report.write_paths(small_run, tmp_path / "paths.csv")
+    rows = read(tmp_path / "paths.csv")
+    assert tuple(rows[0]) == report.PATH_COLUMNS
+    assert [row["rx"] for row in rows] == ["/World/rx_0", "/World/rx_0", "/World/rx_1"]
+    assert [row["interactions"] for row in rows] == [
+        "line_of_sight",
+        "reflection(/World/Wall)",
+        "penetration(/World/Ball)",
+    ]
+    assert rows[0]["vertices"] == "0.000000 0.000000 1.000000; 4.000000 0.000000 1.000000"
+    assert rows[1]["vertices"].count(";") == 2
+
+
+def test_a_path_row_says_what_the_channel_says(small_run):
+    direct = report.path_rows(small_run)[0]
+    assert direct["delay_ns"] == pytest.approx(1e9 * 4.0 / SPEED_OF_LIGHT, rel=1e-12)
+    assert direct["gain_db"] == pytest.approx(20 * np.log10(0.0239 / 4.0), rel=1e-12)
+    expected = np.angle(np.exp(-2j * np.pi * 1e9 * 4.0 / SPEED_OF_LIGHT))
+    assert direct["phase_rad"] == pytest.approx(expected, abs=1e-9)
+    assert direct["aod_azimuth_deg"] == pytest.approx(0.0, abs=1e-9)
+    assert abs(direct["aoa_azimuth_deg"]) == pytest.approx(180.0)
+
+
+@pytest.mark.parametrize(
+    ("direction", "azimuth", "elevation"),
+    [((1, 0, 0), 0, 0), ((0, 1, 0), 90, 0), ((-1, 0, 0), 180, 0), ((0, 0, -1), 0, -90)]
+    + [((0.5, -0.5, 0.5**0.5), -45, 45)],
+)
+def test_angles(direction, azimuth, elevation):
+    angles = report.angles_deg(np.array([direction], dtype=float))
+    assert angles[0] == pytest.approx([azimuth, elevation])
+
+
+def test_links_without_a_path_leave_their_cells_empty(tmp_path):
+    silent = {"tx": "/A", "rx": "/B", "path_gain_db": -np.inf, "rss_dbm": -np.inf}
+    silent |= {"delay_spread_ns": 0.0, "n_paths": 0, "los": False}
+    report.write_links(SimpleNamespace(links=lambda: [silent]), tmp_path / "links.csv")
+    (row,) = read(tmp_path / "links.csv")
+    assert row["path_gain_db"] == "" and row["n_paths"] == "0" and row["los"] == "0"
+
+
+def test_the_channel_file_holds_the_same_bits(small_run, tmp_path):
+    report.write_channel(small_run, tmp_path / "channel.npz")
+    with np.load(tmp_path / "channel.npz", allow_pickle=False) as stored:
+        assert np.array_equal(stored["gain"], small_run.channel.gain.numpy())
+        assert np.array_equal(stored["delay"], small_run.channel.delay.numpy())
+        assert list(stored["rx_paths"]) == ["/World/rx_0", "/World/rx_1"]
+        assert stored["path_gain"].shape == (1, 2, 1)
+        # The file alone gives the channel back.
+        turns = np.exp(-2j * np.pi * stored["frequency"][0] * stored["delay"])
+        heard = (stored["rx"] == 0) & ~stored["blocked"]
+        h = (stored["gain"][:, 0] * turns)[heard].sum()
+        lengths = np.array([4.0, 2 * np.hypot(2.0, 2.9)])
+        gains = 0.0239 / lengths * np.exp(1j * np.array([0.0, 3.0]))
+        expected = (gains * np.exp(-2j * np.pi * 1e9 * lengths / SPEED_OF_LIGHT)).sum()
+        assert h == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_report_is_json_and_complete(small_run, tmp_path):
+    facts = report.report(small_run, seed=3, oddity=float("nan"))
+    report.write_json(facts, tmp_path / "report.json")
+    text = json.loads((tmp_path / "report.json").read_text())
+    assert text["seed"] == 3 and text["oddity"] is None
+    assert text["quality"]["depth"] == 3 and text["paths"] == 3
+    assert text["status_counts"] == {"OK": 3, "OPAQUE": 1}
+    assert set(text["status_meaning"]) == {"OK", "OPAQUE"}
+    assert {"modelled", "left_out", "seconds", "versions", "warnings"} <= set(text)
+
+
+def test_an_output_folder_appears_whole_or_not_at_all(tmp_path):
+    out = tmp_path / "deep" / "out"
+    with pytest.raises(ZeroDivisionError), report.output_folder(out) as folder:
+        (folder / "a.txt").write_text("half")
+        raise ZeroDivisionError
+    assert not out.exists() and not list(out.parent.iterdir())
+    with report.output_folder(out) as folder:
+        (folder / "a.txt").write_text("whole")
+    assert (out / "a.txt").read_text() == "whole"
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_nothing_is_overwritten_unasked(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(report.OutputExists, match="--overwrite"):
+        with report.output_folder(tmp_path):
+            pass
+    with report.output_folder(tmp_path, overwrite=True) as folder:
+        (folder / "links.csv").write_text("new")
+    assert (tmp_path / "mine.txt").read_text() == "mine"
+    assert (tmp_path / "links.csv").read_text() == "new"
+    with pytest.raises(report.OutputExists, match="file"):
+        report.refuse_taken(tmp_path / "mine.txt", overwrite=True)
+
+
+def test_the_scene_table_counts_and_measures(small_run):
+    wall, ball = report.scene_table(small_run.scene)
+    assert (wall["path"], wall["shape"], wall["surface"]) == ("/World/Wall", "box", "conductor")
+    assert wall["size [m]"] == "4 x 0.2 x 3" and ball["at [m]"] == "2 -1 1"
