@@ -1,9 +1,13 @@
 """Transmitters and receivers: prims with a place, an aim and an antenna."""
 
 from dataclasses import dataclass
+from typing import Any
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from rfsg.scene.pose import Pose
 
 
 @dataclass(frozen=True)
@@ -25,3 +29,10 @@ class Radio:
     frequency: float | None = None
     pattern: str = "isotropic"
     polarization: str = "none"
+
+    @staticmethod
+    def at(path: str, x: float, y: float, z: float, yaw_deg: float = 0.0, **fields: Any) -> "Radio":
+        """A still radio at (x, y, z) metres, turned about +z by ``yaw_deg``; other fields by name."""
+        pose = Pose.at(x, y, z, yaw_deg)
+        still = torch.zeros(3, dtype=torch.float64)
+        return Radio(path, pose.translation, pose.rotation, **{"velocity": still, **fields})

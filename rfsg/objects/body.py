@@ -1,0 +1,33 @@
+"""Body(shape, surface): the one concrete RadioObject."""
+
+from jaxtyping import Complex, Float
+from torch import Tensor, nn
+
+from rfsg.objects.contract import Contact, Crossing, Shape, Surface
+
+
+class Body(nn.Module):
+    """A shape joined with a surface; see ``rfsg.objects.contract`` for what each answers."""
+
+    shape: Shape
+    surface: Surface
+
+    def __init__(self, shape: Shape, surface: Surface):
+        super().__init__()
+        self.shape = shape
+        self.surface = surface
+
+    def reflection(
+        self, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        return self.surface.reflection(self.shape, contact, frequency)
+
+    def transmission(
+        self, crossing: Crossing, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        return self.surface.transmission(self.shape, crossing, frequency)
+
+    def excess_delay(
+        self, crossing: Crossing, frequency: Float[Tensor, "f"]
+    ) -> Float[Tensor, "*b f"]:
+        return self.surface.excess_delay(self.shape, crossing, frequency)

@@ -1,0 +1,179 @@
+"""Sphere tracing inside spans: where exactly a ray is inside an object.
+
+A convex shape answers in closed form. A learned one is marched in its own frame with its own
+computed Lipschitz bound, to a *sign change*: stopping where |f| is merely small calls grazing rays
+hits (12 % of them in a trial at the paper's 0.01 m). The root is then polished between its brackets.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rfsg.objects.body import Body
+from rfsg.objects.contract import Shape
+from rfsg.scene.world import World
+from rfsg.tracer.embree import sort_by
+from rfsg.tracer.records import Crossings, Rays, Spans
+
+MOST_ROOTS = 16  # boundaries of one object on one ray; a chair's back has about ten
+
+
+@dataclass(frozen=True)
+class MarchOptions:
+    """step_floor: least step [m], so the thinnest thing sure to be seen. dtype: float32 to search,
+    float64 to evaluate. polish: bisection-safe secant steps on a bracket. chunk: spans at a time."""
+
+    step_floor: float = 1e-3
+    dtype: torch.dtype = torch.float32
+    polish: int = 6
+    chunk: int = 65_536
+
+
+SEARCH = MarchOptions()
+EVALUATE = MarchOptions(dtype=torch.float64, polish=40)
+
+
+@torch.no_grad()
+def crossings(
+    world: World, rays: Rays, spans: Spans, options: MarchOptions = SEARCH
+) -> Crossings:
+    """The true stretches of rays inside objects, within their spans, with outward normals."""
+    convex = world.convex[spans.which]
+    parts = [_convex(world, rays, _select(spans, convex))]
+    if not bool(convex.all()):
+        rest = _select(spans, ~convex)
+        for begin in range(0, len(rest.ray), options.chunk):
+            piece = slice(begin, begin + options.chunk)
+            parts.append(_learned(world, rays, _select(rest, piece), options))
+    ray, which, enter, leave = (torch.cat(column) for column in zip(*parts, strict=True))
+    order = sort_by(ray, enter)
+    ray, which, enter, leave = ray[order], which[order], enter[order], leave[order]
+    normals = _normals(world, rays, ray, which, torch.cat([enter, leave]))
+    return Crossings(
+        ray,
+        which,
+        enter,
+        leave,
+        _zero_where(enter <= 0, normals[: len(ray)]),
+        _zero_where(leave >= rays.limit[ray], normals[len(ray) :]),
+    )
+
+
+def _select(spans: Spans, i: Tensor | slice) -> Spans:
+    return Spans(spans.ray[i], spans.which[i], spans.enter[i], spans.leave[i])
+
+
+def _normals(world: World, rays: Rays, ray: Tensor, which: Tensor, t: Tensor) -> Tensor:
+    ray, which = ray.repeat(2), which.repeat(2)
+    finite = torch.where(torch.isfinite(t), t, torch.zeros_like(t))  # a half-space may never end
+    return world.normal(which, rays.origin[ray] + finite[:, None] * rays.direction[ray])
+
+
+def _zero_where(condition: Tensor, normal: Tensor) -> Tensor:
+    return torch.where(condition[:, None], torch.zeros_like(normal), normal)
+
+
+def _convex(world: World, rays: Rays, spans: Spans) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ray, which = spans.ray, spans.which
+    enter, leave = world.interval(which, rays.origin[ray], rays.direction[ray])
+    enter = torch.clamp(enter, min=0.0)
+    leave = torch.minimum(leave, rays.limit[ray])
+    inside = leave > enter
+    return ray[inside], which[inside], enter[inside], leave[inside]
+
+
+def _learned(
+    world: World, rays: Rays, spans: Spans, options: MarchOptions
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    which = spans.which
+    origin = world.point_object(which, rays.origin[spans.ray])
+    direction = world.direction_object(which, rays.direction[spans.ray])
+    scale = world.scale[which]
+    # the march begins at the span, so that float32 sees only local lengths
+    start = origin + (spans.enter / scale)[:, None] * direction
+    length = (spans.leave - spans.enter) / scale
+    found = []
+    for body, i in world.groups(which):
+        row, t_in, t_out = march(body, start[i], direction[i], length[i], options)
+        k = i[row]
+        enter = spans.enter[k] + t_in * scale[k]
+        leave = spans.enter[k] + t_out * scale[k]
+        # an end at the end of the segment is an end inside; one at the end of the box is a way out
+        found.append((spans.ray[k], which[k], enter, torch.minimum(leave, rays.limit[spans.ray[k]])))
+    return tuple(torch.cat(column) for column in zip(*found, strict=True))  # type: ignore[return-value]
+
+
+def march(
+    body: Body,
+    start: Float[Tensor, "m 3"],
+    direction: Float[Tensor, "m 3"],
+    length: Float[Tensor, "m"],
+    options: MarchOptions,
+) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Float[Tensor, "k"]]:
+    """Stretches (row, enter, leave) where f < 0 along start + t direction, 0 <= t <= length [m].
+
+    Steps are max(|f| / L, step_floor): with L a true bound none skips anything thicker than the floor.
+    """
+    shape = body.shape
+    dtype = options.dtype
+    p0, d, end = start.to(dtype), direction.to(dtype), length.to(dtype)
+    t = torch.zeros_like(end)
+    f = shape.sdf(p0)
+    roots = end.new_full((len(end), MOST_ROOTS), torch.inf)
+    count = torch.zeros(len(end), dtype=torch.int64, device=end.device)
+    starts_inside = f < 0
+    active = torch.nonzero(end > 0).squeeze(-1)
+    brackets: list[tuple[Tensor, ...]] = []
+    while len(active):
+        ta, fa = t[active], f[active]
+        step = torch.clamp(fa.abs() / shape.lipschitz, min=options.step_floor)
+        tb = torch.minimum(ta + step, end[active])
+        fb = shape.sdf(p0[active] + tb[:, None] * d[active])
+        flip = (fa < 0) != (fb < 0)
+        if bool(flip.any()):
+            j = active[flip]
+            brackets.append((j, count[j], ta[flip], tb[flip], fa[flip], fb[flip]))
+            count[j] += 1
+        t[active], f[active] = tb, fb
+        active = active[(tb < end[active]) & (count[active] < MOST_ROOTS)]
+    if brackets:
+        row, slot, a, b, fa, fb = (torch.cat(c) for c in zip(*brackets, strict=True))
+        roots[row, slot] = _polish(shape, p0[row], d[row], a, b, fa, fb, options.polish)
+    return _pair(roots, count, starts_inside, end)
+
+
+def _polish(
+    shape: Shape, p0: Tensor, d: Tensor, a: Tensor, b: Tensor, fa: Tensor, fb: Tensor, rounds: int
+) -> Tensor:
+    """Root of f between a and b by the Illinois method (regula falsi that cannot stall)."""
+    for _ in range(rounds):
+        denominator = fb - fa
+        safe = torch.where(denominator == 0, torch.ones_like(denominator), denominator)
+        c = torch.where(denominator == 0, 0.5 * (a + b), (a * fb - b * fa) / safe)
+        fc = shape.sdf(p0 + c[:, None] * d)
+        crossed = (fc < 0) != (fb < 0)
+        a = torch.where(crossed, b, a)
+        fa = torch.where(crossed, fb, 0.5 * fa)
+        b, fb = c, fc
+        if bool((fc.abs() <= 256 * torch.finfo(fc.dtype).eps).all()):  # a network's own rounding
+            break
+    return b
+
+
+def _pair(
+    roots: Tensor, count: Tensor, starts_inside: Tensor, end: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Roots in order become (enter, leave) pairs; an open end is 0 or the end of the stretch."""
+    roots = torch.sort(roots, dim=1).values
+    padded = torch.cat([torch.zeros_like(end)[:, None], roots, end[:, None]], 1)
+    padded = torch.minimum(padded, end[:, None])
+    # inside at first: pairs (0, 1), (2, 3)...; outside at first: (1, 2), (3, 4)...
+    first = torch.where(starts_inside, 0, 1)
+    number = torch.div(count + 1 + starts_inside.long(), 2, rounding_mode="floor")
+    most = int(number.max()) if len(number) else 0
+    slots = torch.arange(most, device=end.device)
+    row, k = torch.nonzero(slots[None] < number[:, None], as_tuple=True)
+    begin = first[row] + 2 * k
+    return row, padded[row, begin].double(), padded[row, begin + 1].double()

@@ -1,0 +1,90 @@
+"""What a scene and a question need: the Quality that a user turns, and the Plan that follows."""
+
+from dataclasses import dataclass, fields, replace
+
+from rfsg.scene.world import World
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How hard to look. Every field may be overridden: ``Quality.named("draft", depth=2)``.
+
+    depth: most reflections on a path.
+    rays: directions launched from each transmitter (Fibonacci lattice).
+    floor_db: paths weaker than this below free space at the same length are not followed [dB].
+    epsilon: search tolerance of a march on learned shapes [m] (the paper's 0.01 m); hits are polished.
+    crossing_samples: nodes per stretch inside a learned object (transport integral, Eq. 23).
+    integral: "telescoped" in occupancy, or "riemann", the paper's left sum.
+    zone_rings: rings of sample points in a Fresnel zone where a learned surface is measured.
+    refits: most rounds of zone measurement and Newton steps on a path with learned surfaces.
+    newton: most Newton steps per round.
+    chunk: most rays or points at a time (bounds memory).
+    """
+
+    depth: int = 3
+    rays: int = 20_000
+    floor_db: float = -120.0
+    epsilon: float = 0.01
+    crossing_samples: int = 32
+    integral: str = "telescoped"
+    zone_rings: int = 3
+    refits: int = 20
+    newton: int = 12
+    chunk: int = 65_536
+
+    @staticmethod
+    def named(name: str, **overrides: object) -> "Quality":
+        if name not in PRESETS:
+            raise ValueError(
+                f"quality {name!r}: expected one of {', '.join(PRESETS)}; "
+                "single fields are overridden by keyword, e.g. depth=2"
+            )
+        known = {f.name for f in fields(Quality)}
+        wrong = sorted(set(overrides) - known)
+        if wrong:
+            raise ValueError(f"quality field {wrong[0]!r}: expected one of {', '.join(sorted(known))}")
+        return replace(PRESETS[name], **overrides)  # type: ignore[arg-type]
+
+
+PRESETS = {
+    "draft": Quality(depth=2, rays=5_000, floor_db=-60.0, crossing_samples=16, zone_rings=2),
+    "standard": Quality(),
+    "reference": Quality(depth=5, rays=200_000, floor_db=-200.0, crossing_samples=128, zone_rings=5),
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What will be computed for this scene and this question, and what is left out, in sentences."""
+
+    quality: Quality
+    modelled: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def make_plan(world: World, quality: Quality) -> Plan:
+    """Look at the scene and say what it asks for."""
+    scene = world.scene
+    radios = (*scene.transmitters, *scene.receivers)
+    modelled, left_out = ["line of sight and its blocking"], []
+    if len(world) and quality.depth:
+        modelled.append(f"specular reflection up to {quality.depth} times, with penetration between")
+    elif len(world):
+        left_out.append("reflection: the depth asked for is 0")
+    else:
+        left_out.append("reflection and penetration: the scene holds no objects")
+    if bool((~world.exact).any()):
+        modelled.append("learned faces measured over the Fresnel zone before they steer a path")
+    elif len(world):
+        left_out.append("Fresnel-zone measurement of faces: every shape is known exactly")
+    if any(r.polarization != "none" for r in radios):
+        modelled.append("polarisation: complex field vectors along each path")
+    else:
+        left_out.append("polarisation: no radio is polarised; TE and TM are averaged")
+    if any(bool(r.velocity.any()) for r in radios) or bool(world.velocity.any()):
+        modelled.append("Doppler of moving radios and objects")
+    else:
+        left_out.append("Doppler: nothing moves")
+    left_out.append("diffuse scattering and edge diffraction: not in this version")
+    left_out.append(f"paths more than {-quality.floor_db:g} dB below free space of their length")
+    return Plan(quality, tuple(modelled), tuple(left_out))

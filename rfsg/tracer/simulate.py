@@ -1,0 +1,166 @@
+"""From a scene to its channel, the stages in order: plan, search, solve, field."""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from rfsg.scene.radios import Radio
+from rfsg.scene.scene import Scene, SceneError
+from rfsg.scene.world import World
+from rfsg.tracer import field as fields
+from rfsg.tracer.channel import Link, links, transfer
+from rfsg.tracer.embree import Proxies
+from rfsg.tracer.field import SPEED_OF_LIGHT
+from rfsg.tracer.launch import SearchReport, search
+from rfsg.tracer.plan import Plan, Quality, make_plan
+from rfsg.tracer.records import Chains, Channel, Paths, Status
+from rfsg.tracer.solve import solve
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Result:
+    """Everything about one simulation. ``paths`` and ``channel`` share their path axis."""
+
+    scene: Scene
+    frequency: Float[Tensor, "f"]
+    paths: Paths
+    channel: Channel
+    chains: Chains
+    plan: Plan
+    search: SearchReport
+    status_counts: dict[str, int]
+    seconds: dict[str, float]
+    warnings: tuple[str, ...] = field(default=())
+
+    def transfer(self) -> Complex[Tensor, "t r f"]:
+        """h(f) of every transmitter and receiver, antennas included, 1 W in."""
+        return transfer(self.channel, len(self.scene.transmitters), len(self.scene.receivers))
+
+    def path_gain(self) -> Float[Tensor, "t r f"]:
+        """|h(f)|^2, the coherent path gain (linear)."""
+        return self.transfer().abs() ** 2
+
+    def links(self) -> list[Link]:
+        """One record per transmitter and receiver, at the first frequency."""
+        return links(self.scene, self.paths, self.channel)
+
+
+def simulate(
+    scene: Scene,
+    frequency: float | Tensor | None = None,
+    quality: str | Quality = "standard",
+    *,
+    gradients: bool = False,
+    chains: Chains | None = None,
+    device: torch.device | str = "cpu",
+    progress: Progress | None = None,
+) -> Result:
+    """Exact paths and the channel between all transmitters and receivers of a scene.
+
+    frequency: [Hz], one or several [f]; None takes the transmitters' or the scene's own.
+    gradients: keep the graph, so that ``result.channel`` differentiates with respect to poses, radio
+    positions, shapes, materials and weights that require it. chains: candidates kept from an earlier
+    result (the search is skipped). Raises SceneError without a frequency or with broken radios.
+    """
+    quality = Quality.named(quality) if isinstance(quality, str) else quality
+    frequencies = resolve_frequency(scene, frequency).to(device)
+    tx, rx = (positions(r, device) for r in (scene.transmitters, scene.receivers))
+    seconds: dict[str, float] = {}
+    tell = progress or (lambda _: None)
+    with torch.set_grad_enabled(gradients):
+        with _timed(seconds, "plan", tell):
+            world = World(scene, device)
+            plan = make_plan(world, quality)
+        with _timed(seconds, "proxies", tell):
+            proxies = Proxies(world)
+        with _timed(seconds, "search", tell):
+            report = SearchReport()
+            if chains is None:
+                chains, report = search(world, proxies, tx, rx, frequencies, quality)
+        with _timed(seconds, "solve", tell):
+            wavelength = SPEED_OF_LIGHT / float(frequencies[0])
+            paths, counts = solve(world, chains, tx, rx, wavelength, quality)
+        with _timed(seconds, "field", tell):
+            channel = fields.channel(
+                world, proxies, paths, scene.transmitters, scene.receivers, frequencies, quality
+            )
+            paths, channel, counts = _above_floor(paths, channel, counts, quality)
+    named = {s.name: n for s, n in sorted(counts.items())}
+    return Result(
+        scene, frequencies, paths, channel, chains, plan, report, named, seconds, scene.warnings
+    )
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], stage: str, tell: Progress) -> Iterator[None]:
+    tell(stage)
+    start = time.perf_counter()
+    yield
+    seconds[stage] = time.perf_counter() - start
+
+
+def resolve_frequency(scene: Scene, frequency: float | Tensor | None) -> Float[Tensor, "f"]:
+    """The frequencies asked for [Hz]; without any, those of the transmitters, or the scene's."""
+    if frequency is None:
+        own = {r.frequency for r in scene.transmitters if r.frequency is not None}
+        if len(own) > 1:
+            raise SceneError(
+                ["frequency: the transmitters name several; say which, e.g. frequency=2.44e9"]
+            )
+        frequency = own.pop() if own else scene.frequency
+    if frequency is None:
+        raise SceneError(
+            ["frequency: neither given nor in the scene (rfsg:frequencyHz); e.g. frequency=2.44e9"]
+        )
+    asked = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1)
+    if not len(asked) or not bool((torch.isfinite(asked) & (asked > 0)).all()):
+        raise SceneError([f"frequency: expected positive finite hertz, got {frequency!r}"])
+    return asked
+
+
+def positions(radios: tuple[Radio, ...], device: torch.device | str) -> Float[Tensor, "n 3"]:
+    """Radio positions stacked [m]; SceneError for one that is not finite."""
+    bad = [r.path for r in radios if not bool(torch.isfinite(r.position).all())]
+    if bad:
+        raise SceneError([f"{path}: position is not finite" for path in bad])
+    if not radios:
+        return torch.zeros(0, 3, dtype=torch.float64, device=device)
+    return torch.stack([r.position.to(device=device, dtype=torch.float64) for r in radios])
+
+
+def _above_floor(
+    paths: Paths, channel: Channel, counts: dict[Status, int], quality: Quality
+) -> tuple[Paths, Channel, dict[Status, int]]:
+    """Drop what is opaque or below the floor, and count it."""
+    wavelength = SPEED_OF_LIGHT / channel.frequency
+    free = wavelength[None] / (4 * math.pi) / paths.length.clamp(min=1e-300)[:, None]
+    loss = (channel.gain.detach().abs() / free.detach()).amax(1)
+    weak = loss < 10.0 ** (quality.floor_db / 20.0)
+    drop = weak | channel.blocked
+    keep = torch.nonzero(~drop).squeeze(-1)
+    counts = dict(counts)
+    for status, n in (
+        (Status.OPAQUE, int(channel.blocked.sum())),
+        (Status.BELOW_FLOOR, int((weak & ~channel.blocked).sum())),
+    ):
+        if n:
+            counts[status] = counts.get(status, 0) + n
+    for status in (Status.OK, Status.CAUSTIC_CAPPED):
+        if status in counts:
+            counts[status] = int((paths.status[keep] == int(status)).sum())
+    number = torch.full((len(drop),), -1, dtype=torch.int64, device=drop.device)
+    number[keep] = torch.arange(len(keep), device=drop.device)
+    crossed = channel.crossed[~drop[channel.crossed[:, 0]]]
+    crossed = torch.stack([number[crossed[:, 0]], crossed[:, 1]], -1)
+    paths = replace(paths, **{n: getattr(paths, n)[keep] for n in Paths.__dataclass_fields__})
+    per_path = [n for n in Channel.__dataclass_fields__ if n not in ("frequency", "crossed")]
+    kept = {n: getattr(channel, n)[keep] for n in per_path}
+    return paths, replace(channel, crossed=crossed, **kept), counts

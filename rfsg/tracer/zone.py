@@ -1,0 +1,220 @@
+"""The surface that a wave sees: a learned face measured over the first Fresnel zone.
+
+A trained face ripples by half a millimetre; geometrical optics believes every ripple and finds false
+glints and wrong curvatures. A wave of 12 cm does not see them. So the normal and curvature that steer
+and spread a path are those of a least-squares quadric through the zero set around the vertex,
+sampled within the zone where the path length stays within half a wavelength of the stationary one:
+
+    rho^2 = lambda / (1/d1 + 1/d2 + 2 |curvature| cos theta),
+
+which is the flat zone sqrt(lambda d1 d2 / (d1 + d2)) with the bend of the surface taken in. The zone
+is clipped at the object's edges (samples that find no surface, or one that faces elsewhere, carry no
+weight, smoothly) and shrinks where the relief leaves the quadric by more than lambda / 16, so real
+relief survives. Planes and spheres of radius large against rho come out unchanged.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rfsg.objects.contract import Jet
+from rfsg.scene.world import World, unit
+from rfsg.tracer.implicit import transverse
+
+RELIEF = 1.0 / 16.0  # of a wavelength: what a mirror may depart from its quadric (Rayleigh's half)
+ALIGNED = (0.64, 0.87)  # cosines of 50 and 30 degrees: below the first a sample is another face
+SHRINKS = (1.0, 0.5, 0.25, 0.125)  # zone radii tried, largest first
+LEAST_WEIGHT = 0.35  # share of a full zone's weight that must lie on the face
+
+
+@dataclass(frozen=True)
+class Facets:
+    """Local quadrics n.(x - x0) = c + a.uv + uv.P.uv / 2 in the world, one per vertex.
+
+    ``frame`` rows are e1, e2, n. ``residual`` is the rms departure of the samples [m]; ``weight``
+    the share of the zone that lies on the face; ``radius`` the zone's [m].
+    """
+
+    centre: Float[Tensor, "m 3"]
+    frame: Float[Tensor, "m 3 3"]
+    offset: Float[Tensor, "m"]
+    slope: Float[Tensor, "m 2"]
+    bend: Float[Tensor, "m 2 2"]
+    residual: Float[Tensor, "m"]
+    weight: Float[Tensor, "m"]
+    radius: Float[Tensor, "m"]
+
+    def jet(self, point: Float[Tensor, "m 3"]) -> Jet:
+        """The quadric as an implicit function, exact to second order."""
+        local = torch.einsum("mij,mj->mi", self.frame, point - self.centre)
+        uv, height = local[:, :2], local[:, 2]
+        pull = torch.einsum("mij,mj->mi", self.bend, uv)
+        value = height - self.offset - (self.slope * uv).sum(-1) - 0.5 * (pull * uv).sum(-1)
+        tilt = torch.cat([-(self.slope + pull), torch.ones_like(height)[:, None]], -1)
+        gradient = torch.einsum("mji,mj->mi", self.frame, tilt)
+        tangent = self.frame[:, :2]
+        hessian = -tangent.transpose(-1, -2) @ self.bend @ tangent
+        return Jet(value, gradient, hessian)
+
+    def curvature(self) -> Float[Tensor, "m"]:
+        """Largest absolute principal curvature [1/m]."""
+        half_trace = 0.5 * (self.bend[:, 0, 0] + self.bend[:, 1, 1])
+        det = self.bend[:, 0, 0] * self.bend[:, 1, 1] - self.bend[:, 0, 1] ** 2
+        root = torch.sqrt(torch.clamp(half_trace**2 - det, min=0.0))
+        return half_trace.abs() + root
+
+    def resolved(self, wavelength: float) -> Bool[Tensor, "m"]:
+        """True where the zone holds enough of the face, and the face is a mirror to the wave."""
+        return (self.weight >= LEAST_WEIGHT) & (self.residual <= RELIEF * wavelength)
+
+
+def zone_radius(
+    d1: Float[Tensor, "m"],
+    d2: Float[Tensor, "m"],
+    cosine: Float[Tensor, "m"],
+    curvature: Float[Tensor, "m"],
+    wavelength: float,
+) -> Float[Tensor, "m"]:
+    """Radius of the first Fresnel zone on a bent surface [m]."""
+    tiny = torch.finfo(d1.dtype).tiny
+    bend = 1.0 / d1.clamp(min=tiny) + 1.0 / d2.clamp(min=tiny) + 2.0 * curvature * cosine
+    return torch.sqrt(wavelength / bend)
+
+
+def measure(
+    world: World,
+    which: Int[Tensor, "m"],
+    centre: Float[Tensor, "m 3"],
+    normal: Float[Tensor, "m 3"],
+    radius: Float[Tensor, "m"],
+    wavelength: float,
+    rings: int,
+    dtype: torch.dtype = torch.float64,
+) -> Facets:
+    """Fit the quadric of each vertex's zone; the largest of the zones tried that is a mirror.
+
+    ``dtype`` is the precision of the network's evaluation. Frames are laid out in the
+    object's own frame, so moving the whole scene moves the answer and changes nothing else.
+    """
+    normal_object = world.direction_object(which, normal)
+    rows = transverse(normal_object)
+    frame_object = torch.cat([rows, normal_object[:, None]], 1)
+    frame = torch.stack([world.direction_world(which, frame_object[:, k]) for k in range(3)], 1)
+    best = _fit(world, which, centre, frame, radius, rings, dtype)
+    for shrink in SHRINKS[1:]:
+        again = torch.nonzero(~best.resolved(wavelength)).squeeze(-1)
+        if not len(again):
+            break
+        smaller = _fit(
+            world, which[again], centre[again], frame[again], shrink * radius[again], rings, dtype
+        )
+        best = _put(best, again, smaller)
+    return best
+
+
+def disc(rings: int, like: Tensor) -> Float[Tensor, "q 2"]:
+    """A centre and ``rings`` rings of 6 j points in the unit disc."""
+    points = [torch.zeros(1, 2, dtype=torch.float64)]
+    for j in range(1, rings + 1):
+        angle = torch.arange(6 * j, dtype=torch.float64) * (2 * torch.pi / (6 * j))
+        points.append(torch.stack([angle.cos(), angle.sin()], -1) * (j / rings))
+    return torch.cat(points).to(like)
+
+
+def _fit(
+    world: World,
+    which: Tensor,
+    centre: Tensor,
+    frame: Tensor,
+    radius: Tensor,
+    rings: int,
+    dtype: torch.dtype,
+) -> Facets:
+    uv = disc(rings, centre)
+    m, q = len(which), len(uv)
+    flat = which.repeat_interleave(q)
+    plane = torch.einsum("qk,mkj->mqj", uv, frame[:, :2]) * radius[:, None, None]
+    normal = frame[:, 2].repeat_interleave(q, 0)
+    base = (centre[:, None] + plane).reshape(-1, 3)
+    height, aligned, missed = _drop(world, flat, base, normal, radius.repeat_interleave(q), dtype)
+    height, aligned, missed = (x.reshape(m, q) for x in (height, aligned, missed))
+    taper = torch.exp(-2.0 * (uv * uv).sum(-1))
+    weight = taper * _smoothstep(aligned, *ALIGNED)
+    weight = weight * torch.exp(-((missed / (0.02 * radius[:, None])) ** 2))
+    weight = weight * torch.exp(-((height / radius[:, None]) ** 4))
+    return _least_squares(centre, frame, radius, uv, height, weight, taper.sum())
+
+
+def _drop(
+    world: World, which: Tensor, base: Tensor, normal: Tensor, reach: Tensor, dtype: torch.dtype
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Height of the zero set over base points along a normal, its alignment, and |f| left there."""
+    height = base.new_zeros(len(base))
+    for _ in range(3):
+        value, gradient = world.value_and_gradient(which, base + height[:, None] * normal, dtype)
+        along = (gradient * normal).sum(-1)
+        step = value / torch.where(along.abs() > 0.2, along, torch.ones_like(along))
+        height = (height - step).clamp(-reach, reach)
+    value, gradient = world.value_and_gradient(which, base + height[:, None] * normal, dtype)
+    return height, (unit(gradient) * normal).sum(-1), value.abs()
+
+
+def _smoothstep(x: Tensor, low: float, high: float) -> Tensor:
+    t = ((x - low) / (high - low)).clamp(0.0, 1.0)
+    return t * t * (3.0 - 2.0 * t)
+
+
+def _least_squares(
+    centre: Tensor,
+    frame: Tensor,
+    radius: Tensor,
+    uv: Tensor,
+    height: Tensor,
+    weight: Tensor,
+    full: Tensor,
+) -> Facets:
+    """Weighted quadric in units of the zone radius; a hair of ridge keeps lone samples solvable."""
+    u, v = uv[:, 0], uv[:, 1]
+    columns = torch.stack([torch.ones_like(u), u, v, 0.5 * u * u, u * v, 0.5 * v * v], -1)
+    scaled = height / radius[:, None]
+    normal_matrix = torch.einsum("mq,qi,qj->mij", weight, columns, columns)
+    right = torch.einsum("mq,qi,mq->mi", weight, columns, scaled)
+    # flat where nothing says otherwise: the ridge weighs a thousandth of one sample, not on offset
+    ridge = torch.diag(torch.tensor([0.0, 1.0, 1.0, 1.0, 1.0, 1.0], dtype=torch.float64)) * RIDGE
+    floor = torch.eye(6, dtype=torch.float64) * RIDGE * RIDGE
+    matrix = normal_matrix + (ridge + floor).to(normal_matrix.device)
+    coefficient = torch.linalg.solve(matrix, right)
+    left = (scaled - coefficient @ columns.T) * radius[:, None]
+    total = weight.sum(-1)
+    residual = torch.sqrt((weight * left**2).sum(-1) / total.clamp(min=1e-12))
+    c, r = coefficient, radius
+    bend = torch.stack([c[:, 3], c[:, 4], c[:, 4], c[:, 5]], -1).reshape(-1, 2, 2)
+    return Facets(
+        centre,
+        frame,
+        c[:, 0] * r,
+        c[:, 1:3],
+        bend / r[:, None, None],
+        residual,
+        total / full,
+        r,
+    )
+
+
+RIDGE = 1e-6
+
+
+def _put(whole: Facets, i: Tensor, part: Facets) -> Facets:
+    return Facets(
+        *(
+            getattr(whole, name).index_copy(0, i, getattr(part, name))
+            for name in Facets.__dataclass_fields__
+        )
+    )
+
+
+def take(facets: Facets, i: Tensor) -> Facets:
+    """The facets of a selection of vertices."""
+    return Facets(*(getattr(facets, name)[i] for name in Facets.__dataclass_fields__))
