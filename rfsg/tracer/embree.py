@@ -33,7 +33,7 @@ class Proxies:
         self.world = world
         bounds = world.bounds_object
         self.bounded = torch.isfinite(bounds).all(-1).all(-1)
-        corners = self._corners(torch.nonzero(self.bounded).squeeze(-1))
+        corners = self.corners(torch.nonzero(self.bounded).squeeze(-1))
         self.owner = torch.nonzero(self.bounded).squeeze(-1)
         self.unbounded = torch.nonzero(~self.bounded).squeeze(-1)
         # float32 Embree runs about the middle of the scene, so far-off origins cost no precision
@@ -53,7 +53,8 @@ class Proxies:
             triangles = local.cpu().numpy()[:, _TRIANGLES].reshape(-1, 3, 3)
             TriangleMesh(self.scene, np.ascontiguousarray(triangles, dtype=np.float32))
 
-    def _corners(self, which: Int[Tensor, "k"]) -> Float[Tensor, "k 8 3"]:
+    def corners(self, which: Int[Tensor, "k"]) -> Float[Tensor, "k 8 3"]:
+        """Corners of nodes' bounding boxes in the world [m]."""
         world = self.world
         low, high = world.bounds_object[which, 0], world.bounds_object[which, 1]
         bit = torch.tensor(

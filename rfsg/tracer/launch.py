@@ -180,10 +180,10 @@ def amplitude_before(
         loss[known] = -torch.log(strongest.clamp(min=1e-300))
     # a crossing that begins inside another begins before that one has taken its toll: order by
     # where they end, and charge each with those that ended before it begins
-    return torch.exp(-_ended_before(inside, loss))
+    return torch.exp(-ended_before(inside, loss))
 
 
-def _ended_before(inside: Crossings, loss: Tensor) -> Tensor:
+def ended_before(inside: Crossings, loss: Float[Tensor, "m"]) -> Float[Tensor, "m"]:
     """Sum of the losses of crossings on the same ray that end no later than each one begins."""
     m = len(loss)
     if not m:

@@ -18,6 +18,7 @@ class Quality:
     zone_rings: rings of sample points in a Fresnel zone where a learned surface is measured.
     refits: most rounds of zone measurement and Newton steps on a path with learned surfaces.
     newton: most Newton steps per round.
+    map_rays: directions from each transmitter for power estimates and radio maps.
     chunk: most rays or points at a time (bounds memory).
     """
 
@@ -30,6 +31,7 @@ class Quality:
     zone_rings: int = 3
     refits: int = 20
     newton: int = 12
+    map_rays: int = 100_000
     chunk: int = 65_536
 
     @staticmethod
@@ -47,9 +49,18 @@ class Quality:
 
 
 PRESETS = {
-    "draft": Quality(depth=2, rays=5_000, floor_db=-60.0, crossing_samples=16, zone_rings=2),
+    "draft": Quality(
+        depth=2, rays=5_000, floor_db=-60.0, crossing_samples=16, zone_rings=2, map_rays=20_000
+    ),
     "standard": Quality(),
-    "reference": Quality(depth=5, rays=200_000, floor_db=-200.0, crossing_samples=128, zone_rings=5),
+    "reference": Quality(
+        depth=5,
+        rays=200_000,
+        floor_db=-200.0,
+        crossing_samples=128,
+        zone_rings=5,
+        map_rays=1_000_000,
+    ),
 }
 
 
