@@ -183,7 +183,9 @@ def simulate(
     from rfsg.tracer import simulate as tracer
 
     with _bar() as progress:
-        result = tracer.simulate(edited, frequency, question, progress=progress, **_device(device))
+        result = tracer.simulate(
+            edited, frequency, question, device=_device(device), progress=progress
+        )
     asked = {"scene": str(scene), "move": move, "replace": replace, "without": without}
     asked |= {"seed": seed, "device": device, "receivers_file": receivers and str(receivers)}
     chosen = _chosen_links(edited, result, link)
@@ -243,7 +245,7 @@ def map_(
             quality=question,
             transmitter=transmitter,
             seed=seed,
-            **_device(device),
+            device=_device(device),
         )
     asked = {"scene": str(scene), "move": move, "replace": replace, "without": without}
     asked |= {"frequency_hz": frequency or edited.frequency, "height": height, "cell": cell}
@@ -423,15 +425,13 @@ def _seed(seed: int) -> None:
     torch.manual_seed(seed)
 
 
-def _device(name: str) -> dict[str, str]:
-    """The device as an argument, if it is not the one that everything runs on anyway."""
+def _device(name: str) -> str:
+    """The device, if this machine has it. Raises typer.BadParameter."""
     import torch
 
-    if name == "cpu":
-        return {}
-    if not (name.startswith("cuda") and torch.cuda.is_available()):
-        raise typer.BadParameter(f"device {name!r}: this machine offers cpu only")
-    return {"device": name}
+    if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
+        raise typer.BadParameter(f"device {name!r}: this machine offers only cpu")
+    return name
 
 
 def _chosen_links(scene: "Scene", result: Any, asked: list[str]) -> list[tuple[int, int]]:
@@ -540,3 +540,7 @@ def _bar() -> Iterator[Callable[..., None]]:
 def _finish(bars: Any) -> None:
     for task in bars.tasks:
         bars.update(task.id, completed=task.total or 1, total=task.total or 1)
+
+
+if __name__ == "__main__":
+    main()

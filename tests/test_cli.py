@@ -1,0 +1,210 @@
+"""The command line: what it understands, what it writes, what it says when something is wrong."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import typer
+
+from rfsg import cli
+
+SCENE = """#usda 1.0
+(
+    defaultPrim = "World"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Xform "World"
+{
+    custom double rfsg:frequencyHz = 2440000000
+    def Scope "Materials"
+    {
+        def Material "Metal"
+        {
+            custom token rfsg:material:model = "conductor"
+        }
+    }
+    def Cube "Cabinet" (
+        prepend apiSchemas = ["MaterialBindingAPI"]
+    )
+    {
+        double size = 1
+        float3[] extent = [(-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)]
+        rel material:binding = </World/Materials/Metal>
+        double3 xformOp:translate = (2, 2, 1)
+        double3 xformOp:scale = (1, 0.5, 2)
+        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]
+    }
+    def Xform "AP"
+    {
+        custom token rfsg:radio:role = "tx"
+        custom double rfsg:radio:powerDbm = 20
+        double3 xformOp:translate = (0, 0, 1)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+    def Xform "rx_0"
+    {
+        custom token rfsg:radio:role = "rx"
+        double3 xformOp:translate = (4, 0, 1)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+}
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    file = tmp_path / "scene.usda"
+    file.write_text(SCENE)
+    return file
+
+
+@pytest.fixture
+def faked(monkeypatch, small_run, tmp_path):
+    """The command line alone: the scene and the result are those made by hand."""
+    from rfsg.scene.scene import Scene
+
+    asked = {}
+
+    def simulate(scene, frequency, quality, **options):
+        asked.update(scene=scene, frequency=frequency, quality=quality, **options)
+        options["progress"]("search")
+        return small_run
+
+    monkeypatch.setattr(Scene, "from_usd", staticmethod(lambda path: small_run.scene))
+    monkeypatch.setattr("rfsg.tracer.simulate.simulate", simulate)
+    asked["file"] = tmp_path / "made_by_hand.usda"
+    asked["file"].write_text("#usda 1.0\n")
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("text", "hertz"),
+    [("2.44GHz", 2.44e9), ("868 MHz", 868e6), ("2.44e9", 2.44e9), ("5.8ghz", 5.8e9)]
+    + [("100kHz", 1e5), ("1.5e2 Hz", 150.0), ("0.3THz", 3e11)],
+)
+def test_frequencies_have_units(text, hertz):
+    assert cli.parse_frequency(text) == pytest.approx(hertz, rel=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "GHz", "-1GHz", "0", "nan", "inf", "1.2.3GHz", "2 m", "9e9GHz"]
+)
+def test_what_is_not_a_frequency_is_refused(text):
+    with pytest.raises(typer.BadParameter, match="frequency"):
+        cli.parse_frequency(text)
+
+
+def test_quality_fields_keep_their_types():
+    quality = cli.parse_quality("draft", ["depth=4", "epsilon=0.02", "integral=riemann"])
+    assert (quality.depth, quality.epsilon, quality.integral) == (4, 0.02, "riemann")
+    for wrong in ("depth=deep", "nonsense=1", "depth"):
+        with pytest.raises(typer.BadParameter):
+            cli.parse_quality("draft", [wrong])
+
+
+def test_simulate_writes_everything(faked, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = ["simulate", str(faked["file"]), "--out", str(out), "--frequency", "1GHz"]
+    edits = ["--move", "/World/Wall=1,0,-0.5", "--without", "/World/Ball", "--set", "depth=1"]
+    assert cli.run([*arguments, *edits]) == 0
+    names = {"links.csv", "paths.csv", "channel.npz", "report.json", "scene.png", "pdp.png"}
+    assert {file.name for file in out.iterdir()} == names
+    report = json.loads((out / "report.json").read_text())
+    assert report["move"] == ["/World/Wall=1,0,-0.5"] and report["seed"] == 0
+    assert faked["frequency"] == 1e9 and faked["quality"].depth == 1
+    (wall,) = faked["scene"].nodes
+    assert wall.pose.translation.tolist() == [3.0, 3.0, 1.0]
+    printed = capsys.readouterr()
+    assert str(out / "scene.png") in printed.out and "/World/rx_1" in printed.out
+    assert printed.err == "note: a warning\n"  # piped: no progress bar
+
+
+def test_receivers_come_from_a_table(faked, tmp_path):
+    table = tmp_path / "places.csv"
+    table.write_text("name,x,y,z\nbench,1,2,3\n")
+    arguments = ["simulate", str(faked["file"]), "--out", str(tmp_path / "o")]
+    cli.run([*arguments, "--receivers", str(table)])
+    (receiver,) = faked["scene"].receivers
+    assert receiver.path.endswith("/bench") and receiver.position.tolist() == [1.0, 2.0, 3.0]
+
+
+def test_results_are_not_overwritten_unasked(faked, tmp_path, capsys):
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "notes.txt").write_text("mine")
+    arguments = ["simulate", str(faked["file"]), "--out", str(tmp_path / "o")]
+    assert cli.run(arguments) == 2
+    assert "--overwrite" in capsys.readouterr().err and "scene" not in faked
+    assert cli.run([*arguments, "--overwrite"]) == 0
+    assert (tmp_path / "o" / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["simulate", "FILE"], 2, "--out"),
+        (["simulate", "FILE", "--out", "o", "--quality", "best"], 2, "draft, standard, reference"),
+        (["simulate", "FILE", "--out", "o", "--move", "/World/Wall"], 2, "PATH=x,y,z"),
+        (["simulate", "FILE", "--out", "o", "--move", "/World/Wall=1,2"], 2, "three numbers"),
+        (["simulate", "FILE", "--out", "o", "--move", "/World/Wal=1,2,3"], 3, "/World/Wal:"),
+        (["simulate", "FILE", "--out", "o", "--without", "/Nothing"], 3, "/Nothing"),
+        (["simulate", "FILE", "--out", "o", "--replace", "/World/Wall=no.usda"], 3, "no.usda"),
+        (["simulate", "FILE", "--out", "o", "--link", "/A=/B"], 2, "/World/AP=/World/rx_0"),
+        (["simulate", "FILE", "--out", "o", "--device", "abacus"], 2, "abacus"),
+        (["simulate", "nowhere.usda", "--out", "o"], 3, "nowhere.usda"),
+        (["learn-shape", "nowhere.obj", "-o", "a.usda"], 3, "nowhere.obj"),
+        (["learn-shape", "FILE", "-o", "a.usda", "--up", "W"], 2, "--up"),
+        (["dance"], 2, "dance"),
+    ],
+)
+def test_errors_are_one_sentence_and_a_code(
+    faked, tmp_path, monkeypatch, capsys, arguments, code, words
+):
+    monkeypatch.chdir(tmp_path)
+    assert cli.run([a.replace("FILE", str(faked["file"])) for a in arguments]) == code
+    printed = capsys.readouterr()
+    assert words in printed.err and "Traceback" not in printed.err
+    assert printed.err.count("\n") == 1 and printed.err.startswith("rfsg: ")
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(FloatingPointError("singular"), 4), (RuntimeError("a bug"), 1)]
+)
+def test_other_failures_have_their_codes(faked, tmp_path, monkeypatch, capsys, error, code):
+    def fail(*arguments, **options):
+        raise error
+
+    monkeypatch.setattr("rfsg.tracer.simulate.simulate", fail)
+    arguments = ["simulate", str(faked["file"]), "--out", str(tmp_path / "o")]
+    assert cli.run(arguments) == code
+    assert "Traceback" not in capsys.readouterr().err
+    assert cli.run([*arguments, "--debug"]) == code
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["simulate", "map", "check", "info", "learn-shape"])
+def test_help_answers_for_every_command(command, capsys):
+    assert cli.run([command, "--help"]) == 0
+    assert command in capsys.readouterr().out
+
+
+def test_a_real_scene_from_file_to_files(scene_file, tmp_path):
+    """Through the installed entry point, piped: line of sight and one bounce off the cabinet."""
+    out = tmp_path / "out"
+    command = [sys.executable, "-m", "rfsg.cli", "simulate", str(scene_file), "--out", str(out)]
+    done = subprocess.run([*command, "--quality", "draft"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = (out / "paths.csv").read_text().splitlines()
+    assert len(rows) == 3 and "line_of_sight" in rows[1] and "reflection(/World/Cabinet)" in rows[2]
+
+
+def test_check_and_info(scene_file, capsys):
+    assert cli.run(["check", str(scene_file)]) == 0
+    assert cli.run(["info", str(scene_file)]) == 0
+    printed = capsys.readouterr().out
+    assert "/World/Cabinet" in printed and "conductor" in printed and "2.44 GHz" in printed
+    scene_file.write_text(SCENE.replace('"conductor"', '"jelly"'))
+    assert cli.run(["check", str(scene_file)]) == 3
+    assert "jelly" in capsys.readouterr().out
