@@ -16,7 +16,6 @@ from torch import Tensor
 from rfsg.objects.body import Body
 from rfsg.scene import usd
 from rfsg.scene.scene import SceneError
-from rfsg.scene.weights import digest, pack, refuse_overwrite, write_beside
 
 Mesh = tuple[
     Float[ndarray, "v 3"] | Float[Tensor, "v 3"],
@@ -57,21 +56,7 @@ def save_asset(
     provenance cannot be written, or the folder does not exist.
     """
     usda = Path(path).with_suffix(".usda")
-    weights = usda.with_suffix(".safetensors")
-    refuse_overwrite([usda, weights], overwrite)
-    data = pack(body)
-    layer = usd.asset_layer(
-        name or usda.stem,
-        weights.name,
-        digest(data),
-        body.shape,
-        mesh,
-        dict(provenance or {}),
-        color,
-    )
-    # weights first: an interruption in between leaves a hash that does not match, no mix
-    write_beside(weights, data, overwrite)
-    write_beside(usda, layer.encode(), overwrite)
+    usd.write_asset(usda, body, name or usda.stem, mesh, provenance or {}, color, overwrite)
     return usda
 
 

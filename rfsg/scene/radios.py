@@ -32,7 +32,7 @@ class Radio:
 
     @staticmethod
     def at(path: str, x: float, y: float, z: float, yaw_deg: float = 0.0, **fields: Any) -> "Radio":
-        """A still radio at (x, y, z) metres, turned about +z by ``yaw_deg``; other fields by name."""
+        """A still radio at (x, y, z) metres, turned about +z by ``yaw_deg``; more by field name."""
         pose = Pose.at(x, y, z, yaw_deg)
         still = torch.zeros(3, dtype=torch.float64)
         return Radio(path, pose.translation, pose.rotation, **{"velocity": still, **fields})
