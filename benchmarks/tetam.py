@@ -25,7 +25,7 @@ from numpy import ndarray
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "assets" / "scenes" / "tetam_lab.usda"
 PAGE = ROOT / "docs" / "tetam.md"
-PICTURE = ROOT / "docs" / "images" / "tetam.png"
+PICTURES = ROOT / "docs" / "images"
 BEGIN, END = "<!-- results: written by benchmarks/tetam.py -->", "<!-- end of results -->"
 
 # Bluetooth Core Specification, Vol 6 Part B 1.4.1: advertising channels 37, 38, 39, centres [Hz].
@@ -166,16 +166,24 @@ def log_distance(links: Links, exponent: float) -> Float[ndarray, "l"]:
     return -10.0 * exponent * np.log10(links.distance)
 
 
-def score(links: Links, predicted: Float[ndarray, "l"]) -> dict[str, dict[str, float]]:
+def score(
+    links: Links, predicted: Float[ndarray, "l"], sight: Bool[ndarray, "l"] | None = None
+) -> dict[str, dict[str, float]]:
     """Errors per group [dB]: median and 90th percentile of the absolute error, and its RMS.
 
     One beacon was carried on all walks, so its gain is fitted on all of them together, and the rows
-    of single walks keep it.
+    of single walks keep it. With ``sight``, links in sight and in shadow get rows of their own, by
+    the gains of all.
     """
     gains = sensor_gains(links, predicted, links.of([TRAIN]))
     table = {}
     for name, groups in {TRAIN: [TRAIN], "set_2": ["set_2"], "walks": links.walks}.items():
-        table[name] = summary(errors(links, predicted, gains, links.of(groups)))
+        test = links.of(groups)
+        off = errors(links, predicted, gains, test)
+        table[name] = summary(off)
+        if sight is not None:
+            table[f"{name} in sight"] = summary(off[sight[test]])
+            table[f"{name} in shadow"] = summary(off[~sight[test]])
     walked = links.of(links.walks)
     off = errors(links, predicted, gains, walked)
     for walk in links.walks:
@@ -187,6 +195,7 @@ def summary(error: Float[ndarray, "t"]) -> dict[str, float]:
     size = np.abs(error)
     return {
         "links": len(error),
+        "bias_db": float(np.median(error)),
         "median_db": float(np.median(size)),
         "p90_db": float(np.percentile(size, 90)),
         "rms_db": float(np.sqrt(np.mean(error**2))),
@@ -196,56 +205,60 @@ def summary(error: Float[ndarray, "t"]) -> dict[str, float]:
 # Ray tracing
 
 
-def trace(
-    links: Links, quality: str, overrides: dict[str, int], chunk: int
-) -> tuple[dict[str, Float[ndarray, "s n"]], dict[str, float]]:
-    """Path gain [dB] of every sensor and place, as a power sum over paths and coherently.
+@dataclass(frozen=True)
+class Traced:
+    """What rays say of every sensor and place: path gain [dB] summed two ways, who sees whom."""
 
-    Both are averaged over the advertising channels: the power sum in watts, the coherent sum in
-    decibels (each packet's RSSI was read in dBm). Places go in chunks, to bound memory.
-    """
-    import torch
+    power_sum: Float[ndarray, "s n"]
+    coherent_sum: Float[ndarray, "s n"]
+    in_sight: Bool[ndarray, "s n"]
+    paths: Int[ndarray, "s n"]
+    seconds: float
 
-    from rfsg.scene.radios import Radio
+
+def trace(links: Links, quality: str, overrides: dict[str, int], chunk: int) -> Traced:
+    """Trace ``chunk`` places at a time (each chunk searches anew; chunks bound the memory)."""
     from rfsg.scene.scene import Scene
     from rfsg.tracer.plan import Quality
-    from rfsg.tracer.simulate import simulate
 
     scene = Scene.from_usd(SCENE)
     order = [radio.path.rsplit("/", 1)[-1] for radio in scene.transmitters]
-    row = np.array([order.index(name) for name in links.sensors])
+    scene = scene.with_transmitters([scene.transmitters[order.index(n)] for n in links.sensors])
+    begin, parts = time.perf_counter(), []
+    for start in range(0, len(links.place_position), chunk):
+        places = links.place_position[start : start + chunk]
+        parts.append(trace_chunk(scene, places, Quality.named(quality, **overrides)))
+        print(f"traced {start + len(places)} places, {time.perf_counter() - begin:.0f} s")
+    joined = [np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)]
+    return Traced(*joined, time.perf_counter() - begin)
+
+
+def trace_chunk(scene: "Scene", places: Float[ndarray, "n 3"], quality: "Quality") -> tuple:
+    """The arrays of ``Traced``. Gains are averaged over the advertising channels: the power sum in
+    watts, the coherent sum in decibels (the RSSI of each packet was read in dBm)."""
+    import torch
+
+    from rfsg.scene.radios import Radio
+    from rfsg.tracer.simulate import simulate
+
+    still, axes = torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64)
+    beacons = [
+        Radio(f"/World/Radios/beacon_{i}", torch.as_tensor(place), axes, still)
+        for i, place in enumerate(places)
+    ]
     frequency = torch.tensor(ADVERTISING, dtype=torch.float64)
-    shape = (len(order), len(links.place_position))
-    power, coherent, count = np.zeros(shape), np.full(shape, NO_PATH_DB), np.zeros(shape, int)
-    begin = time.perf_counter()
-    for start in range(0, shape[1], chunk):
-        points = torch.as_tensor(links.place_position[start : start + chunk])
-        receivers = [
-            Radio(f"/World/Radios/beacon_{start + i}", p, torch.eye(3).double(), p * 0.0)
-            for i, p in enumerate(points)
-        ]
-        result = simulate(
-            scene.with_receivers(receivers), frequency, quality=Quality.named(quality, **overrides)
-        )
-        c, here = result.channel, (shape[0], len(receivers))
-        link = (c.tx * here[1] + c.rx).detach().cpu()
-        gain = c.gain.detach().cpu()
-        wave = gain * torch.exp(-2j * torch.pi * c.delay.detach().cpu()[:, None] * frequency)
-        field = torch.zeros((here[0] * here[1], len(frequency)), dtype=wave.dtype)
-        field.index_add_(0, link, wave)
-        part = slice(start, start + here[1])
-        squares = (gain.abs() ** 2).mean(1).numpy()
-        power[:, part] = np.bincount(link, squares, here[0] * here[1]).reshape(here)
-        count[:, part] = np.bincount(link, minlength=here[0] * here[1]).reshape(here)
-        coherent[:, part] = decibels(field.abs().numpy() ** 2).mean(1).reshape(here)
-        print(f"traced {part.stop} of {shape[1]} places, {time.perf_counter() - begin:.0f} s")
-    facts = {
-        "seconds": time.perf_counter() - begin,
-        "paths": int(count.sum()),
-        "links_without_path": int((count == 0).sum()),
-        "links_traced": int(count.size),
-    }
-    return {"power sum": decibels(power)[row], "coherent sum": coherent[row]}, facts
+    result = simulate(scene.with_receivers(beacons), frequency, quality)
+    c, shape = result.channel, (len(scene.transmitters), len(places))
+    link = (c.tx * shape[1] + c.rx).numpy()
+    straight = (result.paths.which < 0).all(1)
+    straight[c.crossed[:, 0]] = False
+
+    def total(weights: ndarray | None = None) -> ndarray:
+        return np.bincount(link, weights, minlength=shape[0] * shape[1]).reshape(shape)
+
+    power = total((c.gain.abs() ** 2).mean(1).numpy())
+    coherent = decibels(result.path_gain().numpy()).mean(-1)
+    return decibels(power), coherent, total(straight.numpy()) > 0, total()
 
 
 def decibels(power: Float[ndarray, "*b"]) -> Float[ndarray, "*b"]:
@@ -256,52 +269,41 @@ def decibels(power: Float[ndarray, "*b"]) -> Float[ndarray, "*b"]:
 # Output
 
 
-def table(scores: dict[str, dict[str, dict[str, float]]], links: Links) -> str:
-    groups = [(TRAIN, "set_1 (fitted)"), ("set_2", "set_2"), ("walks", "walks, all")]
-    groups += [(walk, walk.replace("_", " ")) for walk in links.walks]
-    names = list(scores)
+def table(scores: dict[str, dict[str, dict[str, float]]]) -> str:
+    """Markdown: a row per group of links, a column per predictor."""
+    names, groups = list(scores), next(iter(scores.values()))
     lines = ["| links of | number | " + " | ".join(names) + " |", "|---" * (len(names) + 2) + "|"]
-    for key, title in groups:
+    for key, first in groups.items():
         cells = [f"{s[key]['median_db']:.2f} / {s[key]['p90_db']:.2f}" for s in scores.values()]
-        number = next(iter(scores.values()))[key]["links"]
-        lines.append(f"| {title} | {number} | " + " | ".join(cells) + " |")
+        if "sight" in key or "shadow" in key:
+            cells = [
+                f"{c} ({s[key]['bias_db']:+.1f})"
+                for c, s in zip(cells, scores.values(), strict=True)
+            ]
+        title = key.replace("_", " ") + (" (gains fitted)" if key == TRAIN else "")
+        lines.append(f"| {title} | {first['links']} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def picture(links: Links, predictors: dict[str, Float[ndarray, "l"]], path: Path) -> None:
-    """Measured against predicted RSS on set_2 and the walks, and how the errors are distributed."""
-    import matplotlib
+def picture(
+    links: Links, predictors: dict[str, Float[ndarray, "l"]], groups: list[str], path: Path
+) -> None:
+    """Measured against predicted RSS on the links of ``groups``, and the CDF of the errors."""
+    from rfsg.plot import comparison_figure, save
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    shown = [name for name in predictors if name in ("power sum", "log-distance")]
-    figure, axes = plt.subplots(1, len(shown) + 1, figsize=(4.6 * (len(shown) + 1), 4.4))
-    for axis, name in zip(axes, shown, strict=False):
-        gains = sensor_gains(links, predictors[name], links.of([TRAIN]))
-        for title, groups in {"walks": links.walks, "set_2": ["set_2"]}.items():
-            test = links.of(groups)
-            measured = links.rss[test]
-            predicted = measured - errors(links, predictors[name], gains, test)
-            axis.plot(predicted, measured, ".", ms=2, alpha=0.5, label=title)
-        low, high = links.rss.min(), links.rss.max()
-        axis.plot([low, high], [low, high], "k", lw=0.8)
-        axis.set(title=name, xlabel="predicted [dBm]", ylabel="measured [dBm]")
-        axis.set(xlim=(low - 5, high), ylim=(low - 5, high))
-        axis.legend(markerscale=4)
+    test, train = links.of(groups), links.of([TRAIN])
+    measured = links.rss[test]
+    said = {}
     for name, predicted in predictors.items():
-        gains = sensor_gains(links, predicted, links.of([TRAIN]))
-        size = np.sort(np.abs(errors(links, predicted, gains, links.of(["set_2"]))))
-        axes[-1].plot(size, np.linspace(0, 1, len(size)), label=name)
-    axes[-1].set(title="set_2", xlabel="absolute error [dB]", ylabel="share of links", xlim=(0, 15))
-    axes[-1].grid(alpha=0.3)
-    axes[-1].legend()
-    figure.tight_layout()
+        gains = sensor_gains(links, predicted, train)
+        said[name] = measured - errors(links, predicted, gains, test)
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_suffix(".part.png")
-    figure.savefig(beside, dpi=110)
-    beside.replace(path)
-    plt.close(figure)
+    save(comparison_figure(measured, said, title=f"tetam-ble, {path.stem}"), path)
+
+
+def pictures(links: Links, predictors: dict[str, Float[ndarray, "l"]], folder: Path) -> None:
+    picture(links, predictors, ["set_2"], folder / "tetam_set_2.png")
+    picture(links, predictors, links.walks, folder / "tetam_walks.png")
 
 
 def write(path: Path, text: str) -> None:
@@ -335,7 +337,7 @@ def main() -> None:
     parser.add_argument("--quality", default="standard", help="draft, standard or reference")
     parser.add_argument("--depth", type=int, help="most reflections on a path")
     parser.add_argument("--rays", type=int, help="directions launched from each sensor")
-    parser.add_argument("--chunk", type=int, default=128, help="places at a time")
+    parser.add_argument("--chunk", type=int, default=1024, help="places at a time")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "tetam")
     parser.add_argument("--baseline-only", action="store_true", help="no ray tracing")
     parser.add_argument("--write-docs", action="store_true", help="write docs/tetam.md too")
@@ -347,35 +349,42 @@ def main() -> None:
 
     exponent = log_distance_exponent(links, links.of([TRAIN]))
     predictors = {
-        "gains only": np.zeros_like(links.rss),
         "free space": log_distance(links, 2.0),
         "log-distance": log_distance(links, exponent),
+        "gains only": np.zeros_like(links.rss),
     }
-    report = {"log_distance_exponent": exponent}
+    report: dict = {"log_distance_exponent": exponent}
     said = f"Log-distance exponent fitted on {TRAIN}: {exponent:.2f}."
+    sight = None
     if not options.baseline_only:
         overrides = {k: v for k in ("depth", "rays") if (v := getattr(options, k)) is not None}
-        traced, facts = trace(links, options.quality, overrides, options.chunk)
-        found = {name: value[links.sensor, links.place] for name, value in traced.items()}
-        predictors = found | predictors
-        report |= facts | {"quality": options.quality} | overrides
+        traced = trace(links, options.quality, overrides, options.chunk)
+        at = (links.sensor, links.place)
+        rays = {"power sum": traced.power_sum[at], "coherent sum": traced.coherent_sum[at]}
+        predictors, sight = rays | predictors, traced.in_sight[at]
+        report |= {"quality": options.quality, "seconds": traced.seconds} | overrides
+        report |= {"paths": int(traced.paths.sum()), "pairs": traced.paths.size}
+        report["pairs_without_path"] = int((traced.paths == 0).sum())
         extra = "".join(f", {k} {v}" for k, v in overrides.items())
         said += (
-            f" Ray tracing at quality `{options.quality}`{extra}: {facts['paths']} paths on "
-            f"{facts['links_traced']} links in {facts['seconds']:.0f} s; "
-            f"{facts['links_without_path']} links without any path."
+            f" Ray tracing at quality `{options.quality}`{extra}: {report['paths']} paths between "
+            f"{report['pairs']} pairs of sensor and place in {traced.seconds:.0f} s; "
+            f"{report['pairs_without_path']} pairs have no path at all. A link is in sight when "
+            "its straight line crosses no box of the scene."
         )
-    scores = {name: score(links, predicted) for name, predicted in predictors.items()}
-    results = "Median / 90th percentile of the absolute error [dB].\n\n" + table(scores, links)
-    results += f"\n\n{said}"
+    scores = {name: score(links, predicted, sight) for name, predicted in predictors.items()}
+    results = (
+        "Median / 90th percentile of the absolute error [dB]; in brackets the median error, "
+        f"measured minus predicted.\n\n{table(scores)}\n\n{said}"
+    )
     print(results)
     write(options.out / "results.json", json.dumps(report | {"scores": scores}, indent=1) + "\n")
     write_links(links, predictors, options.out / "links.csv")
-    picture(links, predictors, options.out / "tetam.png")
-    print(f"wrote {options.out}/results.json, links.csv, tetam.png")
+    pictures(links, predictors, options.out)
+    print(f"wrote {options.out}/results.json, links.csv, tetam_set_2.png, tetam_walks.png")
     if options.write_docs:
         write_page(results)
-        picture(links, predictors, PICTURE)
+        pictures(links, predictors, PICTURES)
 
 
 if __name__ == "__main__":

@@ -51,7 +51,7 @@ def bounds(scene: Scene) -> np.ndarray:
     """World bounds [n 2 3] of the scene's boxes, which all stand upright."""
     found = []
     for node in scene.nodes:
-        corners = node.pose.point_world(node.body.bounds().double()).detach().numpy()
+        corners = node.pose.point_world(node.body.shape.bounds().double()).detach().numpy()
         found.append([corners.min(0), corners.max(0)])
     return np.array(found)
 
@@ -60,7 +60,8 @@ def distance(scene: Scene, point: torch.Tensor) -> float:
     """From a point to the nearest box [m], negative inside one."""
     nodes = scene.nodes
     return min(
-        float(n.pose.scale * n.body.sdf(n.pose.point_object(point)[None]).double()) for n in nodes
+        float(n.pose.scale * n.body.shape.sdf(n.pose.point_object(point)[None]).double())
+        for n in nodes
     )
 
 
