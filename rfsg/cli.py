@@ -38,6 +38,11 @@ app = typer.Typer(
 )
 
 
+class Method(StrEnum):
+    rays = "rays"
+    paths = "paths"
+
+
 class Axis(StrEnum):
     Y = "Y"
     Z = "Z"
@@ -209,8 +214,12 @@ def map_(
     height: Annotated[float, typer.Option(help="Height of the plane [m].")] = 1.2,
     cell: Annotated[float, typer.Option(help="Size of a cell [m].", min=1e-3)] = 0.5,
     transmitter: Annotated[
-        str | None, typer.Option(help="Path of one transmitter. Default: the sum of all.")
+        str | None,
+        typer.Option(metavar="PATH", help="Draw this one. Default: the strongest in each cell."),
     ] = None,
+    method: Annotated[
+        Method, typer.Option(help="rays: mean over each cell, fast. paths: exact at its centre.")
+    ] = Method.rays,
     frequency: Frequency = None,
     quality: Preset = "standard",
     changes: Changes = [],
@@ -232,7 +241,8 @@ def map_(
     question = parse_quality(quality, changes)
     report.refuse_taken(out, overwrite)
     edited = _edited(_read(scene), move, replace, without, None)
-    _seed(seed)
+    shown = None if transmitter is None else _transmitter(edited, transmitter)
+    where = _device(device)
     from rfsg.tracer import radiomap
 
     with _bar() as progress:
@@ -243,19 +253,20 @@ def map_(
             height=height,
             cell=cell,
             quality=question,
-            transmitter=transmitter,
+            method=method.value,
             seed=seed,
-            device=_device(device),
+            device=where,
         )
     asked = {"scene": str(scene), "move": move, "replace": replace, "without": without}
-    asked |= {"frequency_hz": frequency or edited.frequency, "height": height, "cell": cell}
-    asked |= {"seed": seed, "device": device, "quality": question, "versions": report.versions()}
+    asked |= {"frequency_hz": found.frequency, "height": height, "cell": cell}
+    asked |= {"method": method.value, "seed": seed, "device": device, "quality": question}
+    asked |= {"warnings": edited.warnings, "versions": report.versions()}
     from rfsg import plot
 
     with report.output_folder(out, overwrite) as folder:
         report.write_map(found, folder / "map.npz")
         report.write_json(asked, folder / "report.json")
-        plot.save(plot.map_figure(found, edited), folder / "map.png")
+        plot.save(plot.map_figure(found, edited, shown), folder / "map.png")
     _print_files(out, ("map.npz", "map.png"))
 
 
@@ -383,7 +394,7 @@ def _note(sentence: str) -> None:
 
 
 def _must_exist(file: Path) -> None:
-    if not file.is_file():
+    if not file.exists() or file.is_dir():
         raise FileNotFoundError(2, "no such file", str(file))
 
 
@@ -432,6 +443,14 @@ def _device(name: str) -> str:
     if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
         raise typer.BadParameter(f"device {name!r}: this machine offers only cpu")
     return name
+
+
+def _transmitter(scene: "Scene", path: str) -> int:
+    paths = [radio.path for radio in scene.transmitters]
+    if path not in paths:
+        known = ", ".join(paths) or "none"
+        raise typer.BadParameter(f"transmitter {path!r}: the scene has {known}")
+    return paths.index(path)
 
 
 def _chosen_links(scene: "Scene", result: Any, asked: list[str]) -> list[tuple[int, int]]:

@@ -27,6 +27,7 @@ from rfsg.scene.scene import Node, Scene
 
 MOST_PATHS = 300  # more lines than this only blacken a picture; the strongest are drawn
 DYNAMIC_RANGE_DB = 45.0  # below the strongest path; weaker ones are not drawn
+MOST_NAMES = 12  # more labels than this cover what they name
 SLICES = 7  # horizontal cuts that show a curved or learned object in 3-D
 GRID = (56, 56, 28)  # samples of an implicit function across an object's bounds
 
@@ -113,11 +114,18 @@ def delay_figure(scene: Scene, channel: Any, links: Sequence[tuple[int, int]]) -
     return figure
 
 
-def map_figure(radio_map: Any, scene: Scene, title: str = "") -> Figure:
-    """Received power [dBm] over a plane, with the objects that stand in it."""
+def map_figure(
+    radio_map: Any, scene: Scene, transmitter: int | None = None, title: str = ""
+) -> Figure:
+    """Received power [dBm] over a plane, with the objects that stand in it.
+
+    transmitter: its index; None shows the strongest in each cell. Grey where nothing arrives.
+    """
     x, y = _numpy(radio_map.x), _numpy(radio_map.y)
-    level = np.asarray(_numpy(radio_map.rss_dbm()), dtype=float)
-    level = np.ma.masked_invalid(np.where(_numpy(radio_map.path_gain) > 0, level, np.nan))
+    level = _numpy(
+        radio_map.best_dbm() if transmitter is None else radio_map.rss_dbm()[transmitter]
+    )
+    level = np.ma.masked_invalid(level)
     width, depth = np.ptp(_edges(x)), np.ptp(_edges(y))
     figure = Figure(figsize=(8.5, 1.6 + 7.0 * min(1.4, depth / width)), layout="constrained")
     axes = figure.add_subplot()
@@ -131,8 +139,9 @@ def map_figure(radio_map: Any, scene: Scene, title: str = "") -> Figure:
     _radios(axes, scene, receivers=False)
     axes.set(xlim=_ends(_edges(x)), ylim=_ends(_edges(y)))
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figure.colorbar(image, ax=axes, shrink=0.85).set_label("received power [dBm]")
-    text = title or f"received power at z = {float(radio_map.height):g} m"
+    figure.colorbar(image, ax=axes, shrink=0.85).set_label("received signal strength [dBm]")
+    whose = "strongest signal" if best and len(scene.transmitters) > 1 else "signal"
+    text = title or f"{whose} at z = {float(radio_map.height):g} m"
     axes.set_title(text, loc="right", fontsize=11)
     return figure
 
@@ -173,19 +182,21 @@ def draw_top(axes: Axes, scene: Scene) -> None:
     Flat ones (floors, ceilings) are left unfilled: they would hide what stands on them.
     """
     low, high = scene_bounds(scene)
+    named = []
     for node in scene.nodes:
         rings = footprint(node)
-        size = np.ptp(corners(node), axis=0)
-        solid = size[2] > 0.5 * min(size[0], size[1])
-        small = size[:2].max() < 0.4 * (high - low)[:2].max()
+        thin, wide, tall = _extent(node)
+        thing = wide < 0.4 * (high - low)[:2].max() and thin > 0.2 * wide
         for ring in rings:
-            patch = Polygon(ring, fill=bool(solid), facecolor=_THING if small else _WALL)
-            patch.set(edgecolor=_EDGE, linewidth=1.0, zorder=2)
+            color = _THING if thing else _WALL
+            patch = Polygon(ring, fill=bool(tall > 0.5 * thin), facecolor=color, zorder=2)
+            patch.set(edgecolor=_EDGE, linewidth=1.0)
             axes.add_patch(patch)
-        if rings and solid and small:
-            middle = np.concatenate(rings).mean(axis=0)
-            label = axes.annotate(_name(node.path), middle, ha="center", va="center", zorder=5)
-            label.set(fontsize=8, path_effects=[withStroke(linewidth=2.5, foreground="white")])
+        if rings and thing:
+            named.append((_name(node.path), np.concatenate(rings).mean(axis=0)))
+    for name, middle in named if len(named) <= MOST_NAMES else []:
+        label = axes.annotate(name, middle, ha="center", va="center", zorder=5)
+        label.set(fontsize=8, path_effects=[withStroke(linewidth=2.5, foreground="white")])
     margin = 0.04 * (high - low)[:2].max()
     axes.set(xlim=(low[0] - margin, high[0] + margin))
     axes.set(ylim=(low[1] - margin, high[1] + margin))
@@ -300,6 +311,13 @@ def _contours(x: np.ndarray, y: np.ndarray, value: np.ndarray) -> list[np.ndarra
     axes = Figure().add_subplot()
     rings = axes.contour(x, y, value, levels=[0.0]).allsegs[0] if (value < 0).any() else []
     return [ring for ring in rings if len(ring) > 2]
+
+
+def _extent(node: Node) -> tuple[float, float, float]:
+    """Smaller and larger horizontal size and height [m] of an object's own box, turned upright."""
+    low, high = _numpy(node.body.shape.bounds().detach().double())
+    x, y, z = float(node.pose.scale) * np.abs(_numpy(node.pose.rotation)).round(3).T @ (high - low)
+    return min(x, y), max(x, y), z
 
 
 def _to_world(frame: Pose, ring: np.ndarray, z: float) -> np.ndarray:

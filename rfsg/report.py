@@ -138,7 +138,7 @@ def arriving(channel: Any) -> np.ndarray:
 
 def angles_deg(direction: np.ndarray) -> np.ndarray:
     """Azimuth and elevation [deg] of unit vectors [n, 3]: [n, 2]."""
-    x, y, z = direction.T
+    x, y, z = direction.T + 0.0  # -0 would turn +180 degrees into -180
     azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
     return np.degrees(np.stack([azimuth, elevation], axis=-1))
 
@@ -166,15 +166,20 @@ def write_channel(result: Any, file: Path) -> None:
 
 
 def write_map(radio_map: Any, file: Path) -> None:
-    """map.npz: x [nx] and y [ny] in m, height, path_gain [ny, nx] linear, error_db, rss_dbm."""
+    """map.npz: x [nx] and y [ny], cell centres in m; path_gain [tx, ny, nx] linear, error_db and
+    rss_dbm alike; tx_paths, height [m], cell [m], frequency [Hz]."""
+    radios = radio_map.scene.transmitters
     np.savez_compressed(
         file,
         x=_numpy(radio_map.x),
         y=_numpy(radio_map.y),
-        height=float(radio_map.height),
         path_gain=_numpy(radio_map.path_gain),
         error_db=_numpy(radio_map.error_db),
         rss_dbm=_numpy(radio_map.rss_dbm()),
+        tx_paths=np.array([radio.path for radio in radios], dtype=str),
+        height=float(radio_map.height),
+        cell=float(radio_map.cell),
+        frequency=float(radio_map.frequency),
     )
 
 
@@ -285,7 +290,7 @@ def _cell(value: Any) -> Any:
     if isinstance(value, bool | np.bool_):
         return int(value)
     if isinstance(value, float | np.floating):
-        return f"{float(value):.9g}" if np.isfinite(value) else ""
+        return f"{float(value) + 0.0:.9g}" if np.isfinite(value) else ""  # no -0
     return value
 
 

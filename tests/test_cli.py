@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import typer
 
@@ -198,6 +199,19 @@ def test_a_real_scene_from_file_to_files(scene_file, tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     rows = (out / "paths.csv").read_text().splitlines()
     assert len(rows) == 3 and "line_of_sight" in rows[1] and "reflection(/World/Cabinet)" in rows[2]
+
+
+def test_a_map_of_a_real_scene(scene_file, tmp_path, capsys):
+    out = tmp_path / "map"
+    arguments = ["map", str(scene_file), "--out", str(out), "--cell", "1", "--quality", "draft"]
+    assert cli.run([*arguments, "--transmitter", "/World/Nobody"]) == 2
+    assert "/World/AP" in capsys.readouterr().err
+    assert cli.run([*arguments, "--set", "map_rays=2000"]) == 0
+    assert {file.name for file in out.iterdir()} == {"map.npz", "map.png", "report.json"}
+    with np.load(out / "map.npz", allow_pickle=False) as stored:
+        size = (1, len(stored["y"]), len(stored["x"]))
+        assert stored["path_gain"].shape == stored["error_db"].shape == size
+        assert not np.isnan(stored["path_gain"]).any()
 
 
 def test_check_and_info(scene_file, capsys):

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from rfsg import plot
 from rfsg.objects.body import Body
@@ -66,11 +67,10 @@ def test_path_lines_drop_the_padding_and_the_blocked(small_run):
 
 def test_figures_are_saved_as_pictures(small_run, tmp_path):
     scene = small_run.scene
-    rss = np.linspace(-80.0, -40.0, 30).reshape(5, 6)
-    radio_map = SimpleNamespace(
-        x=np.arange(6.0), y=np.arange(5.0), height=1.2, rss_dbm=lambda: rss,
-        path_gain=np.where(rss > -79.0, 10 ** (rss / 10), 0.0),
-    )  # fmt: skip
+    rss = torch.linspace(-80.0, -40.0, 60).reshape(2, 5, 6)
+    rss[:, 0, 0] = -torch.inf
+    axes = {"x": np.arange(6.0), "y": np.arange(5.0), "height": 1.2}
+    radio_map = SimpleNamespace(rss_dbm=lambda: rss, best_dbm=lambda: rss.amax(0), **axes)
     measured = np.linspace(-90.0, -40.0, 50)
     figures = {
         "run": plot.scene_figure(scene, small_run.paths, small_run.channel),
@@ -79,6 +79,7 @@ def test_figures_are_saved_as_pictures(small_run, tmp_path):
         "delay": plot.delay_figure(scene, small_run.channel, [(0, 0), (0, 1)]),
         "silence": plot.delay_figure(scene, small_run.channel, []),
         "map": plot.map_figure(radio_map, scene),
+        "second": plot.map_figure(radio_map, scene, 1),
         "compared": plot.comparison_figure(measured, {"rfsg": measured + 1.0}),
     }
     for name, figure in figures.items():
