@@ -1,0 +1,318 @@
+"""The paper's learned surface (section 4): a network gives m, alpha, phi; transport gives the rest.
+
+One scalar model for TE and TM, without dispersion. What the paper leaves open is closed as follows:
+R = exp(-a_out * interaction_length), so the gain of a reflection does not depend on a numerical
+step; phi in [-pi/2, pi/2] and Re a >= 0, so nothing amplifies; every boundary crossed carries
+sqrt(1 - |R|^2) ("conserving"), unless the paper's literal form is asked for ("paper").
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from rfsg.objects.contract import Contact, Crossing, Shape
+from rfsg.objects.physics import transport
+from rfsg.objects.surfaces.interface import (
+    at_boundary,
+    contact_cosine,
+    crossing_cosines,
+    crossing_direction,
+)
+
+WIDTH = 128  # of the material network, and of the shape's feature h (paper section 5.1)
+LAYERS = 8
+SKIP = 4  # the layer that sees the inputs again
+CHUNK = 16384  # points per network sweep without gradients: bounds memory, and fits a cache
+# Heads start at given values; beyond +-40 sigmoid and softplus are at their ends to float64
+# rounding.
+SATURATION = 40.0
+# sqrt(1 - |R|^2) has no slope at |R| = 1; below -120 dB it continues as a line.
+PASSED_POWER_FLOOR = 1e-12
+INTERFACES = ("conserving", "paper")
+
+
+class Fields(NamedTuple):
+    """What the network says at points: m >= 0, alpha in [0, 1], phi [rad], kappa [Np/m] or None."""
+
+    m: Float[Tensor, "*b"]
+    alpha: Float[Tensor, "*b"]
+    phi: Float[Tensor, "*b"]
+    kappa: Float[Tensor, "*b"] | None
+
+
+class _Samples(NamedTuple):
+    f: Tensor
+    gradient: Tensor
+    fields: Fields
+
+
+class StochasticSurface(nn.Module):
+    """A learned material on any shape.
+
+    The fields start constant at ``m``, ``alpha``, ``phi`` [rad] and, if given, ``bulk`` = kappa
+    [Np/m] (a true bulk loss, which the paper's sigma lacks; None leaves it out). ``sharpness`` s
+    [1/m] and ``interaction_length`` [m] belong to the object and are kept as logarithms.
+    ``samples`` is the number of intervals of a crossing. ``law``, ``interface`` and ``integral``
+    name the variants. Weights are cast to the dtype of the points: float32 to search, float64 to
+    evaluate. Raises ValueError naming the argument at fault.
+    """
+
+    kind = "stochastic"
+    opaque = False
+
+    def __init__(
+        self,
+        m: float = 1.0,
+        alpha: float = 0.9,
+        phi: float = 0.0,
+        sharpness: float = 40.0,
+        interaction_length: float = 0.05,
+        bulk: float | None = None,
+        law: str = "logistic",
+        interface: str = "conserving",
+        integral: str = "telescoped",
+        samples: int = 32,
+    ):
+        super().__init__()
+        _require(0 <= m < math.inf, "m", m, "a number >= 0")
+        _require(0 <= alpha <= 1, "alpha", alpha, "a number in [0, 1]")
+        _require(abs(phi) <= math.pi / 2, "phi", phi, "an angle in [-pi/2, pi/2] rad")
+        _require(0 < sharpness < math.inf, "sharpness", sharpness, "a number > 0 [1/m]")
+        _require(
+            0 < interaction_length < math.inf,
+            "interaction_length",
+            interaction_length,
+            "metres > 0",
+        )
+        _require(bulk is None or 0 <= bulk < math.inf, "bulk", bulk, "None or Np/m >= 0")
+        _require(interface in INTERFACES, "interface", interface, "conserving or paper")
+        _require(integral in transport.INTEGRALS, "integral", integral, "telescoped or riemann")
+        _require(samples >= 1, "samples", samples, "a number of intervals >= 1")
+        self.law = transport.law_named(law)
+        self.interface, self.integral, self.samples = interface, integral, samples
+        self._start = {"m": m, "alpha": alpha, "phi": phi, "bulk": bulk}
+        self.log_sharpness = _scalar(math.log(sharpness))
+        self.log_interaction_length = _scalar(math.log(interaction_length))
+        self.layers = nn.ModuleList(_layers())
+        heads = [_inverse_softplus(m), _logit(alpha), _inverse_phase(phi)]
+        heads += [] if bulk is None else [_inverse_softplus(bulk)]
+        self.head_weight = nn.Parameter(torch.zeros(len(heads), WIDTH))
+        self.head_bias = nn.Parameter(torch.tensor(heads, dtype=torch.float64))
+
+    @property
+    def sharpness(self) -> Float[Tensor, ""]:
+        """s [1/m]."""
+        return self.log_sharpness.exp()
+
+    @property
+    def interaction_length(self) -> Float[Tensor, ""]:
+        """Length over which a reflection interacts with the object [m]."""
+        return self.log_interaction_length.exp()
+
+    def config(self) -> dict:
+        """Constructor arguments, JSON-able, without the weights."""
+        return {
+            **self._start,
+            "sharpness": self.sharpness.item(),
+            "interaction_length": self.interaction_length.item(),
+            "law": self.law.name,
+            "interface": self.interface,
+            "integral": self.integral,
+            "samples": self.samples,
+        }
+
+    def fields(self, shape: Shape, point: Float[Tensor, "*b 3"]) -> Fields:
+        """m, alpha, phi and kappa at points [m], for reports and regularisation."""
+        feature = getattr(shape, "feature", None)
+        return self._network(shape, point, None if feature is None else feature(point))
+
+    def reflection(
+        self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """R = exp(-a_out * interaction_length), the same for TE and TM.
+
+        A vertex a hair inside counts as on the boundary: a_out is taken at max(f, 0).
+        """
+        at = self._sample(shape, contact.point)
+        a = self._interaction(at, at.f.clamp(min=0.0), contact_cosine(contact))
+        return _expand((-a).exp(), frequency)
+
+    def transmission(
+        self, shape: Shape, crossing: Crossing, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """Whole crossings: boundary, exp(-integral of a), boundary; the same for TE and TM.
+
+        An end whose normal is given lies on f = 0, and f is put to 0 there: that is its value, and
+        (the vertex moves with the surface) also its derivative. The same bits from end to start.
+        """
+        at = self._sample(shape, self._points(crossing))
+        at = at._replace(f=_pin(at.f, crossing))
+        through = (-self._integral(at, crossing)).exp()
+        if self.interface == "conserving":
+            through = through * self._passed(at, crossing)
+        return _expand(through, frequency)
+
+    def excess_delay(
+        self, shape: Shape, crossing: Crossing, frequency: Float[Tensor, "f"]
+    ) -> Float[Tensor, "*b f"]:
+        """Zero [s]: the model has no dispersion."""
+        point = crossing.start
+        return point.new_zeros(*point.shape[:-1], len(frequency))
+
+    def _points(self, crossing: Crossing) -> Tensor:
+        """Sample points along crossings; from end to start they are the same, to the bit."""
+        weight = torch.linspace(0, 1, self.samples + 1, dtype=torch.float64)
+        weight = weight.to(crossing.start)[:, None]
+        start, end = crossing.start[..., None, :], crossing.end[..., None, :]
+        return start * weight.flip(0) + end * weight
+
+    def _integral(self, at: _Samples, crossing: Crossing) -> Tensor:
+        direction = crossing_direction(crossing)
+        length = ((crossing.end - crossing.start) * direction).sum(-1)
+        return transport.INTEGRALS[self.integral](
+            self.law,
+            at.f,
+            at.gradient,
+            at.fields.m,
+            at.fields.alpha,
+            at.fields.phi,
+            self.sharpness.to(at.f),
+            direction,
+            length / self.samples,
+            at.fields.kappa,
+        )
+
+    def _interaction(self, at: _Samples, f: Tensor, cosine: Tensor) -> Tensor:
+        """a_out * interaction_length, complex."""
+        m, alpha, phi, _ = at.fields
+        slope = transport.gradient_norm(at.gradient)
+        mix = transport.sigma_mix(alpha, cosine)
+        s = self.sharpness.to(f)
+        sigma = transport.sigma_outside(self.law, f, slope, m, mix, s)
+        return sigma * self.interaction_length.to(f) * transport.phasor(phi)
+
+    def _passed(self, at: _Samples, crossing: Crossing) -> Tensor:
+        """Product of sqrt(1 - |R|^2) over the ends that lie on the boundary."""
+        normals = (crossing.normal_start, crossing.normal_end)
+        amplitude = []
+        for i, cosine, normal in zip((0, -1), crossing_cosines(crossing), normals, strict=True):
+            end = _at(at, i)
+            passed = -torch.expm1(-2 * self._interaction(end, torch.zeros_like(end.f), cosine).real)
+            amplitude.append(torch.where(at_boundary(normal), _amplitude(passed), 1.0))
+        return amplitude[0] * amplitude[1]
+
+    def _sample(self, shape: Shape, point: Tensor) -> _Samples:
+        """f, its gradient and the fields at points; in chunks where no gradient is asked for."""
+        flat = point.reshape(-1, 3)
+        chunks = (flat,) if torch.is_grad_enabled() else flat.split(CHUNK)
+        parts = [self._sweep(shape, chunk) for chunk in chunks]
+        batch = point.shape[:-1]
+        f = torch.cat([part.f for part in parts]).reshape(batch)
+        gradient = torch.cat([part.gradient for part in parts]).reshape(*batch, 3)
+        columns = zip(*(part.fields for part in parts), strict=True)
+        fields = (None if c[0] is None else torch.cat(c).reshape(batch) for c in columns)
+        return _Samples(f, gradient, Fields(*fields))
+
+    def _sweep(self, shape: Shape, point: Tensor) -> _Samples:
+        fused = getattr(shape, "value_gradient_feature", None)
+        if fused is not None:
+            f, gradient, feature = fused(point)
+            return _Samples(f, gradient, self._network(shape, point, feature))
+        f, gradient = shape.value_and_gradient(point)
+        return _Samples(f, gradient, self.fields(shape, point))
+
+    def _network(self, shape: Shape, point: Tensor, feature: Tensor | None) -> Fields:
+        """The heads at points; a shape without features counts as h = 0, and costs nothing."""
+        inputs = _normalised(shape, point)
+        if feature is not None:
+            if feature.shape[-1] != WIDTH:
+                raise ValueError(
+                    f"stochastic surface: expected {WIDTH} features from the {shape.kind} shape, "
+                    f"got {feature.shape[-1]}: it was made with another number of features"
+                )
+            inputs = torch.cat([inputs, feature.to(point.dtype)], -1)
+        x = inputs
+        for i, layer in enumerate(self.layers):
+            x = torch.cat([x, inputs], -1) if i == SKIP else x
+            weight = layer.weight.to(point)[:, : x.shape[-1]]  # h stands last
+            x = _squareplus(linear(x, weight, layer.bias.to(point)))
+        heads = linear(x, self.head_weight.to(x), self.head_bias.to(x)).unbind(-1)
+        m, alpha = nn.functional.softplus(heads[0]), torch.sigmoid(heads[1])
+        phi = 0.5 * math.pi * torch.tanh(heads[2])
+        return Fields(m, alpha, phi, None if len(heads) < 4 else nn.functional.softplus(heads[3]))
+
+
+def _layers() -> list[nn.Linear]:
+    """Eight layers of 128; inputs (x, h), given again at the skip. Spread kept by He's rule."""
+    inputs = 3 + WIDTH
+    widths = [inputs] + [WIDTH + inputs if i == SKIP else WIDTH for i in range(1, LAYERS)]
+    layers = [nn.Linear(width, WIDTH) for width in widths]
+    for layer in layers:
+        nn.init.normal_(layer.weight, std=math.sqrt(2 / layer.in_features))
+        nn.init.zeros_(layer.bias)
+    return layers
+
+
+def _squareplus(x: Tensor) -> Tensor:
+    """(x + sqrt(x^2 + 1)) / 2: smooth, positive, without transcendental functions."""
+    return 0.5 * (x + (x.square() + 1).sqrt())
+
+
+def _normalised(shape: Shape, point: Tensor) -> Tensor:
+    """Points in half diagonals of the object about its middle; metres if it has no bounds."""
+    low, high = shape.bounds().detach().to(point)
+    middle, half = 0.5 * (low + high), 0.5 * (high - low).norm()
+    bounded = torch.isfinite(low).all() & torch.isfinite(high).all() & (half > 0)
+    middle = torch.where(bounded, middle, torch.zeros_like(middle))
+    return (point - middle) / torch.where(bounded, half, torch.ones_like(half))
+
+
+def _pin(f: Tensor, crossing: Crossing) -> Tensor:
+    first = torch.where(at_boundary(crossing.normal_start), 0.0, f[..., 0])
+    last = torch.where(at_boundary(crossing.normal_end), 0.0, f[..., -1])
+    return torch.cat([first[..., None], f[..., 1:-1], last[..., None]], -1)
+
+
+def _at(samples: _Samples, i: int) -> _Samples:
+    fields = Fields(*(None if x is None else x[..., i] for x in samples.fields))
+    return _Samples(samples.f[..., i], samples.gradient[..., i, :], fields)
+
+
+def _amplitude(power: Tensor) -> Tensor:
+    """sqrt of a power in [0, 1], with a finite slope at 0."""
+    line = power / math.sqrt(PASSED_POWER_FLOOR)
+    return torch.where(power < PASSED_POWER_FLOOR, line, power.clamp(min=PASSED_POWER_FLOOR).sqrt())
+
+
+def _expand(x: Tensor, frequency: Tensor) -> Tensor:
+    return x[..., None, None].expand(*x.shape, len(frequency), 2)
+
+
+def _scalar(value: float) -> nn.Parameter:
+    return nn.Parameter(torch.tensor(value, dtype=torch.float64))
+
+
+def _inverse_softplus(value: float) -> float:
+    if value > SATURATION:
+        return value
+    return math.log(math.expm1(value)) if value > math.exp(-SATURATION) else -SATURATION
+
+
+def _logit(value: float) -> float:
+    if value in (0.0, 1.0):
+        return SATURATION if value else -SATURATION
+    return min(max(math.log(value / (1 - value)), -SATURATION), SATURATION)
+
+
+def _inverse_phase(value: float) -> float:
+    ratio = value / (math.pi / 2)
+    return math.atanh(ratio) if abs(ratio) < 1 else math.copysign(0.5 * SATURATION, ratio)
+
+
+def _require(condition: bool, name: str, got: object, expected: str) -> None:
+    if not condition:
+        raise ValueError(f"stochastic surface: {name}: expected {expected}, got {got!r}")
