@@ -122,9 +122,8 @@ def map_figure(
     transmitter: its index; None shows the strongest in each cell. Grey where nothing arrives.
     """
     x, y = _numpy(radio_map.x), _numpy(radio_map.y)
-    level = _numpy(
-        radio_map.best_dbm() if transmitter is None else radio_map.rss_dbm()[transmitter]
-    )
+    best = transmitter is None
+    level = _numpy(radio_map.best_dbm() if best else radio_map.rss_dbm()[transmitter])
     level = np.ma.masked_invalid(level)
     width, depth = np.ptp(_edges(x)), np.ptp(_edges(y))
     figure = Figure(figsize=(8.5, 1.6 + 7.0 * min(1.4, depth / width)), layout="constrained")
