@@ -74,10 +74,9 @@ class Proxies:
 
     def _candidates(self, rays: Rays) -> tuple[Tensor, Tensor]:
         """(ray, node) pairs that Embree proposes, each once."""
-        n, k = rays.origin.shape[0], len(self.world)
-        pairs = [_product(n, self.unbounded)]
+        pairs = [_product(rays.origin.shape[0], self.unbounded)]
         if self.scene is not None:
-            active = torch.arange(n, device=rays.origin.device)
+            active = torch.arange(rays.origin.shape[0], device=rays.origin.device)
             done = torch.zeros_like(rays.limit)
             while len(active):
                 start = rays.origin[active] + done[active, None] * rays.direction[active]
@@ -92,8 +91,7 @@ class Proxies:
                 reached = torch.maximum(done[active] + distance, torch.clamp(leave, max=1e300))
                 done[active] = reached + 0.5 * self.gap
                 active = active[done[active] < rays.limit[active]]
-        code = torch.unique(torch.cat([r * max(k, 1) + w for r, w in pairs]))
-        return code // max(k, 1), code % max(k, 1)
+        return _distinct(pairs, rays.origin.shape[0], len(self.world))
 
     def _with_neighbours(self, ray: Tensor, node: Tensor) -> tuple[Tensor, Tensor]:
         inverse = torch.full((len(self.world),), -1, dtype=torch.int64, device=node.device)
@@ -114,6 +112,21 @@ class Proxies:
         distance = torch.from_numpy(out["tfar"].astype(np.float64)).to(origin.device)
         missed = torch.from_numpy(out["geomID"].astype(np.int64)).to(origin.device) < 0
         return torch.where(missed | (triangle < 0), -1, triangle // len(_TRIANGLES)), distance
+
+
+def _distinct(pairs: list[tuple[Tensor, Tensor]], n: int, k: int) -> tuple[Tensor, Tensor]:
+    """Pairs without repeats, in order of ray: by a table of flags, or by sorting if it were large."""
+    ray, which = (torch.cat(column) for column in zip(*pairs, strict=True))
+    if n * k <= MOST_FLAGS:
+        seen = torch.zeros(n, k, dtype=torch.bool, device=ray.device)
+        seen[ray, which] = True
+        found, node = torch.nonzero(seen, as_tuple=True)
+        return found, node
+    code = torch.unique(ray * k + which)
+    return code // k, code % k
+
+
+MOST_FLAGS = 1 << 28  # bytes of such a table
 
 
 @torch.no_grad()

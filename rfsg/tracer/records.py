@@ -94,7 +94,7 @@ class Paths:
     tx: Int[Tensor, "p"]
     rx: Int[Tensor, "p"]
     which: Int[Tensor, "p d"]
-    vertices: Float[Tensor, "p d+2 3"]
+    vertices: Float[Tensor, "p v 3"]
     normal: Float[Tensor, "p d 3"]
     length: Float[Tensor, "p"]  # [m]
     spread: Float[Tensor, "p"]  # [1/m], 1/length in free space

@@ -49,7 +49,7 @@ class Batch:
     def take(self, i: Tensor) -> "Batch":
         return Batch(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
 
-    def polyline(self, x: Tensor | None = None) -> Float[Tensor, "c d+2 3"]:
+    def polyline(self, x: Tensor | None = None) -> Float[Tensor, "c v 3"]:
         x = self.x if x is None else x
         return torch.cat([self.tx[:, None], x, self.rx[:, None]], 1)
 
