@@ -7,6 +7,7 @@ sqrt(1 - |R|^2) ("conserving"), unless the paper's literal form is asked for ("p
 """
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -42,6 +43,11 @@ class Fields(NamedTuple):
     alpha: Float[Tensor, "*b"]
     phi: Float[Tensor, "*b"]
     kappa: Float[Tensor, "*b"] | None
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> "Fields":
+        """The same change made to every field there is."""
+        kappa = None if self.kappa is None else change(self.kappa)
+        return Fields(change(self.m), change(self.alpha), change(self.phi), kappa)
 
 
 class _Samples(NamedTuple):
@@ -213,9 +219,8 @@ class StochasticSurface(nn.Module):
         batch = point.shape[:-1]
         f = torch.cat([part.f for part in parts]).reshape(batch)
         gradient = torch.cat([part.gradient for part in parts]).reshape(*batch, 3)
-        columns = zip(*(part.fields for part in parts), strict=True)
-        fields = (None if c[0] is None else torch.cat(c).reshape(batch) for c in columns)
-        return _Samples(f, gradient, Fields(*fields))
+        fields = _joined([part.fields for part in parts]).each(lambda field: field.reshape(batch))
+        return _Samples(f, gradient, fields)
 
     def _sweep(self, shape: Shape, point: Tensor) -> _Samples:
         fused = getattr(shape, "value_gradient_feature", None)
@@ -238,8 +243,7 @@ class StochasticSurface(nn.Module):
         x = inputs
         for i, layer in enumerate(self.layers):
             x = torch.cat([x, inputs], -1) if i == SKIP else x
-            weight = layer.weight.to(point)[:, : x.shape[-1]]  # h stands last
-            x = _squareplus(linear(x, weight, layer.bias.to(point)))
+            x = _squareplus(_linear(layer, x))
         heads = linear(x, self.head_weight.to(x), self.head_bias.to(x)).unbind(-1)
         m, alpha = nn.functional.softplus(heads[0]), torch.sigmoid(heads[1])
         phi = 0.5 * math.pi * torch.tanh(heads[2])
@@ -257,6 +261,12 @@ def _layers() -> list[nn.Linear]:
     return layers
 
 
+def _linear(layer: nn.Module, x: Tensor) -> Tensor:
+    """A layer in the precision of its input; a missing h, which stands last, is left out."""
+    assert isinstance(layer, nn.Linear)
+    return linear(x, layer.weight.to(x)[:, : x.shape[-1]], layer.bias.to(x))
+
+
 def _squareplus(x: Tensor) -> Tensor:
     """(x + sqrt(x^2 + 1)) / 2: smooth, positive, without transcendental functions."""
     return 0.5 * (x + (x.square() + 1).sqrt())
@@ -271,6 +281,12 @@ def _normalised(shape: Shape, point: Tensor) -> Tensor:
     return (point - middle) / torch.where(bounded, half, torch.ones_like(half))
 
 
+def _joined(parts: list[Fields]) -> Fields:
+    m, alpha, phi = (torch.cat([part[:3][i] for part in parts]) for i in range(3))
+    kappa = [part.kappa for part in parts if part.kappa is not None]
+    return Fields(m, alpha, phi, torch.cat(kappa) if kappa else None)
+
+
 def _pin(f: Tensor, crossing: Crossing) -> Tensor:
     first = torch.where(at_boundary(crossing.normal_start), 0.0, f[..., 0])
     last = torch.where(at_boundary(crossing.normal_end), 0.0, f[..., -1])
@@ -278,7 +294,7 @@ def _pin(f: Tensor, crossing: Crossing) -> Tensor:
 
 
 def _at(samples: _Samples, i: int) -> _Samples:
-    fields = Fields(*(None if x is None else x[..., i] for x in samples.fields))
+    fields = samples.fields.each(lambda field: field[..., i])
     return _Samples(samples.f[..., i], samples.gradient[..., i, :], fields)
 
 

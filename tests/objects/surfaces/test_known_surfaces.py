@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from surface_scenes import chords, contacts, reverse, through_wall
 
 from rfsg.objects.body import Body
 from rfsg.objects.catalogue import SURFACES, shape_class, surface_class
@@ -15,6 +14,7 @@ from rfsg.objects.contract import Contact, RadioObject, Surface
 from rfsg.objects.physics import fresnel, media
 from rfsg.objects.surfaces.interface import Conductor, Dielectric, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
+from tests.objects.surfaces.surface_scenes import chords, contacts, reverse, through_wall
 
 F64, C128 = torch.float64, torch.complex128
 FREQUENCY = torch.tensor([2.4e9, 28e9], dtype=F64)

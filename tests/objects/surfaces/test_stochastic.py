@@ -7,13 +7,13 @@ from functools import cache
 
 import pytest
 import torch
-from surface_scenes import chords, contacts, ground, reverse, through_wall
 
 from rfsg.objects.contract import Contact, Crossing, Surface
 from rfsg.objects.physics.transport import LAWS
 from rfsg.objects.shapes.neural import NeuralShape
 from rfsg.objects.surfaces import stochastic
 from rfsg.objects.surfaces.stochastic import StochasticSurface
+from tests.objects.surfaces.surface_scenes import chords, contacts, ground, reverse, through_wall
 
 F64 = torch.float64
 FREQUENCY = torch.tensor([2.4e9, 28e9], dtype=F64)
@@ -333,3 +333,11 @@ def test_extremes(integral, law, s, m, phi, dtype):
 def test_bad_arguments_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         StochasticSurface(**arguments)
+
+
+def test_an_empty_batch_is_answered():
+    surface = StochasticSurface(bulk=1.0)
+    shape, crossing = chords(3)
+    none = Crossing(*(x[:0] for x in vars(crossing).values()))
+    with torch.no_grad():
+        assert surface.transmission(shape, none, FREQUENCY).shape == (0, 2, 2)
