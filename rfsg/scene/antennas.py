@@ -19,6 +19,7 @@ HALF_WAVE_DIRECTIVITY = 1.6409223769845853  # 4 / Cin(2 pi), Balanis section 4.6
 ELEMENT_GAIN_DB = 8.0  # 3GPP TR 38.901 Table 7.3-1: G_E,max
 ELEMENT_WIDTH_DEG = 65.0  # theta_3dB = phi_3dB
 ELEMENT_FLOOR_DB = 30.0  # SLA_V = A_max
+ON_AXIS = 1e-12  # [rad] nearer to the z axis the azimuth of a rounded direction means nothing
 
 
 def isotropic(direction: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -50,8 +51,9 @@ def tr38901(direction: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """
     x, y, z = direction.unbind(-1)
     sine = _sine(direction)
-    on_axis = sine == 0
-    azimuth = torch.rad2deg(torch.atan2(y, torch.where(on_axis, torch.ones_like(x), x)))
+    on_axis = sine < ON_AXIS
+    x = torch.where(on_axis, torch.ones_like(x), x)
+    azimuth = torch.rad2deg(torch.atan2(torch.where(on_axis, torch.zeros_like(y), y), x))
     zenith = torch.rad2deg(torch.atan2(sine, z))
     vertical = (12.0 * ((zenith - 90.0) / ELEMENT_WIDTH_DEG) ** 2).clamp(max=ELEMENT_FLOOR_DB)
     horizontal = (12.0 * (azimuth / ELEMENT_WIDTH_DEG) ** 2).clamp(max=ELEMENT_FLOOR_DB)

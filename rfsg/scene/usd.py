@@ -135,7 +135,7 @@ def read(
     *,
     variants: Mapping[str, Mapping[str, str]] | None = None,
     asset_roots: Sequence[str | Path] = (),
-    time: float | None = None,
+    time: int | float | None = None,
     device: torch.device | str = "cpu",
 ) -> Scene:
     """Read a USD scene (usda, usdc, usd, usdz) into metres, z up.
@@ -151,9 +151,10 @@ def read(
     """
     with _quiet():
         reader = _Reader.open(Path(path), variants or {}, asset_roots, time, device)
-        scene = reader.scene()
-    if reader.faults:
-        raise SceneError(reader.faults)
+        scene, faults = reader.scene(), reader.faults
+        del reader  # a traceback that somebody keeps must not keep the stage open
+    if faults:
+        raise SceneError(faults)
     return scene
 
 
@@ -171,7 +172,8 @@ def check(path: str | Path, **options: Any) -> list[str]:
         reader.scene()
         validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
         found = UsdValidation.ValidationContext(validators).Validate(reader.stage)
-        own = {"CompositionError"}  # said by ``read`` already
+        # what does not compose or resolve is among the reader's faults, with its prim
+        own = {"CompositionError", "UnresolvableDependency"} if reader.faults else set()
         named = [_finding(e, str(path)) for e in found if e.GetName() not in own]
         faults = list(dict.fromkeys([*reader.faults, *named]))
         del found
@@ -219,7 +221,7 @@ def _safe_layers(path: Path, roots: Sequence[Path], faults: list[str]) -> list[S
         file = todo.pop()
         reason = files.unsafe_layer(file)
         try:
-            layer = None if reason else Sdf.Layer.FindOrOpen(file)
+            layer = None if reason else _current(file)
         except Tf.ErrorException as error:
             layer, reason = None, _pxr_words(error)
         if layer is None:
@@ -238,6 +240,15 @@ def _safe_layers(path: Path, roots: Sequence[Path], faults: list[str]) -> list[S
     return layers
 
 
+def _current(file: str) -> Sdf.Layer | None:
+    """The layer as the file is now: pxr hands out one that is open already, however old. Edits that
+    somebody has not saved yet are left alone."""
+    layer = Sdf.Layer.FindOrOpen(file)
+    if layer and not layer.dirty:
+        layer.Reload()
+    return layer
+
+
 def _look_up(given: str, anchored: str, roots: Sequence[Path]) -> tuple[str, str]:
     """(resolved path or "", why it is refused or "") of an asset path."""
     if files.is_url(given):
@@ -251,7 +262,8 @@ def _users(layer: Sdf.Layer, given: str) -> str:
     users: list[str] = []
 
     def visit(path: Sdf.Path) -> None:
-        spec = layer.GetPrimAtPath(path) if path.IsPrimOrPrimVariantSelectionPath() else None
+        prim = path.IsPrimPath() or path.IsPrimVariantSelectionPath()
+        spec = layer.GetPrimAtPath(path) if prim else None
         if spec:
             arcs = [*spec.referenceList.GetAddedOrExplicitItems()]
             arcs += spec.payloadList.GetAddedOrExplicitItems()
@@ -300,7 +312,7 @@ class _Reader:
         path: Path,
         variants: Mapping[str, Mapping[str, str]],
         asset_roots: Sequence[str | Path],
-        time: float | None,
+        time: int | float | None,
         device: torch.device | str,
     ) -> "_Reader":
         roots = (files.default_root(path), *(Path(r) for r in asset_roots))
@@ -347,8 +359,7 @@ class _Reader:
     def _choose(self, variants: Mapping[str, Mapping[str, str]]) -> None:
         with Usd.EditContext(self.stage, self.stage.GetSessionLayer()):
             for path, choices in variants.items():
-                valid = Sdf.Path.IsValidPathString(str(path))
-                prim = self.stage.GetPrimAtPath(path) if valid else None
+                prim = self.stage.GetPrimAtPath(path) if _prim_path(path) else None
                 if not prim:
                     self.faults.append(f"{path}: no prim here to choose variants on")
                     continue
@@ -1198,7 +1209,8 @@ def _refuse_paths(paths: Sequence[str]) -> None:
 
 
 def _prim_path(path: str) -> bool:
-    return Sdf.Path.IsValidPathString(path) and Sdf.Path(path).IsAbsoluteRootOrPrimPath()
+    valid = bool(Sdf.Path.IsValidPathString(path))
+    return valid and path.startswith("/") and Sdf.Path(path).IsPrimPath()
 
 
 def _unused(name: str, taken: set[str]) -> str:
