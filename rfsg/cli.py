@@ -44,8 +44,8 @@ class Method(StrEnum):
 
 
 class Axis(StrEnum):
-    Y = "Y"
-    Z = "Z"
+    y = "y"
+    z = "z"
 
 
 def main() -> None:
@@ -312,11 +312,14 @@ def info(
 def learn_shape(
     mesh: Annotated[Path, typer.Argument(help="A watertight mesh: .obj, .ply, .glb or .stl.")],
     asset: Annotated[Path, typer.Option("--out", "-o", help="The asset to write: NAME.usda.")],
-    steps: Annotated[
-        int | None, typer.Option(help="Training steps. Default: chosen for the size.", min=1)
-    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Training steps.", min=1)] = None,
     scale: Annotated[float, typer.Option(help="Metres per unit of the mesh.")] = 1.0,
-    up: Annotated[Axis | None, typer.Option(help="Axis of the mesh that points up.")] = None,
+    up: Annotated[
+        Axis | None,
+        typer.Option(
+            case_sensitive=False, help="Axis that points up. Default: y for .glb, z otherwise."
+        ),
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option("--resume/--fresh", help="Go on from an interrupted run."),
@@ -326,7 +329,7 @@ def learn_shape(
 ) -> None:
     """Train a neural shape from a mesh, and write it as an asset that scenes can reference.
 
-    Example: rfsg learn-shape cabinet.obj -o assets/objects/cabinet.usda
+    Example: rfsg learn-shape cabinet.obj -o cabinet.usda
     """
     _must_exist(mesh)
     from rfsg.learn.geometry import learn_shape_file
@@ -339,7 +342,7 @@ def learn_shape(
             asset,
             seed=seed,
             scale=scale,
-            progress=progress,
+            progress=lambda step, total, note: progress("training", step, total, note),
             resume=resume,
             overwrite=overwrite,
             **options,
@@ -374,6 +377,8 @@ def _verdict(error: Exception) -> tuple[str, int]:
         "OutOfMemoryError",
     ):
         return f"numeric problem: {error or kind}; --set chunk=4096 needs less memory", NUMERIC
+    if kind == "LearnError":  # a training that ended in something unusable
+        return str(error), NUMERIC
     if isinstance(error, ValueError) or kind.endswith("Error") and _is_ours(error):
         return str(error), INPUT
     return f"rfsg itself failed ({kind}: {error}); --debug shows where", INTERNAL
@@ -533,7 +538,7 @@ def _short(value: Any) -> str:
 
 @contextmanager
 def _bar() -> Iterator[Callable[..., None]]:
-    """progress(stage) or progress(stage, done, total) as bars on stderr; quiet when piped.
+    """progress(stage) or progress(stage, done, total, note): bars on stderr; quiet when piped.
 
     A stage without counts is over when the next one begins.
     """
@@ -545,12 +550,15 @@ def _bar() -> Iterator[Callable[..., None]]:
     tasks: dict[str, Any] = {}
     with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
 
-        def progress(stage: str, done: float | None = None, total: float | None = None) -> None:
+        def progress(
+            stage: str, done: float | None = None, total: float | None = None, note: str = ""
+        ) -> None:
             if stage not in tasks:
                 _finish(bars)
                 tasks[stage] = bars.add_task(stage, total=total)
             if done is not None:
-                bars.update(tasks[stage], completed=done, total=total)
+                text = f"{stage}: {note}" if note else stage
+                bars.update(tasks[stage], completed=done, total=total, description=text)
 
         yield progress
         _finish(bars)

@@ -60,13 +60,13 @@ def scene_figure(scene: Scene, paths: Any = None, channel: Any = None, title: st
     if paths is not None and channel is not None:
         lines, gain_db = path_lines(paths, channel)
         if lines:
-            strength = 1.0 + (gain_db - gain_db.max()) / DYNAMIC_RANGE_DB
+            scale = ScalarMappable(Normalize(gain_db.min(), gain_db.max()), _PATHS)
+            strength = np.asarray(scale.norm(gain_db))
             look: dict[str, Any] = {"array": gain_db, "cmap": _PATHS}
-            look |= {"linewidths": 0.3 + 1.2 * strength**2, "alpha": 0.25 + 0.7 * strength}
+            look |= {"linewidths": 0.3 + 1.2 * strength**2, "alpha": 0.15 + 0.8 * strength}
             flat = LineCollection([line[:, :2] for line in lines], zorder=3, **look)
             top.add_collection(flat)
             space.add_collection3d(Line3DCollection(lines, **look))
-            scale = ScalarMappable(Normalize(gain_db.min(), gain_db.max()), _PATHS)
             bar = figure.colorbar(scale, ax=[top, space], shrink=0.75, pad=0.02)
             bar.set_label(f"path gain [dB], the {len(lines)} strongest")
     _radios(top, scene)
@@ -184,8 +184,8 @@ def draw_top(axes: Axes, scene: Scene) -> None:
     named = []
     for node in scene.nodes:
         rings = footprint(node)
-        thin, wide, tall = _extent(node)
-        thing = wide < 0.4 * (high - low)[:2].max() and thin > 0.2 * wide
+        thin, _, tall = _extent(node)
+        thing = _is_thing(node, (high - low)[:2].max())
         for ring in rings:
             color = _THING if thing else _WALL
             patch = Polygon(ring, fill=bool(tall > 0.5 * thin), facecolor=color, zorder=2)
@@ -231,7 +231,9 @@ def sampled(node: Node) -> tuple[Pose, np.ndarray, np.ndarray, np.ndarray, np.nd
     The frame is the object's own where that stands upright (a thin wall that is turned keeps its
     resolution), else the world's.
     """
-    upright = abs(float(node.pose.rotation[2, 2])) > 1.0 - 1e-9  # rounding of a turn about z
+    upright = (
+        abs(float(node.pose.rotation[2, 2].detach())) > 1.0 - 1e-9
+    )  # rounding of a turn about z
     frame = node.pose if upright else Pose.identity()
     box = _numpy(frame.point_object(torch.as_tensor(corners(node))))
     low, high = box.min(axis=0), box.max(axis=0)
@@ -270,8 +272,8 @@ def _draw_space(axes: Any, scene: Scene) -> None:
         box = corners(node)
         boxy = node.body.shape.kind == "box"
         edges = [box[list(pair)] for pair in _BOX_EDGES] if boxy else slices(node)
-        large = np.ptp(box, axis=0).max() > 0.4 * (high - low).max()
-        look: dict[str, Any] = {"linewidths": 0.5 if large else 0.9, "alpha": 0.5 if large else 1.0}
+        thing = _is_thing(node, (high - low)[:2].max())
+        look: dict[str, Any] = {"linewidths": 0.9 if thing else 0.5, "alpha": 1.0 if thing else 0.5}
         if edges:
             axes.add_collection3d(Line3DCollection(edges, colors=_EDGE, **look))
     size = np.maximum(high - low, 0.1 * (high - low).max() + 1e-3)
@@ -312,10 +314,20 @@ def _contours(x: np.ndarray, y: np.ndarray, value: np.ndarray) -> list[np.ndarra
     return [ring for ring in rings if len(ring) > 2]
 
 
+def _is_thing(node: Node, scene_size: float) -> bool:
+    """Furniture rather than part of the building: neither long nor wall-like. For looks only."""
+    thin, wide, _ = _extent(node)
+    return wide < 0.4 * scene_size and thin > 0.2 * wide
+
+
 def _extent(node: Node) -> tuple[float, float, float]:
     """Smaller and larger horizontal size and height [m] of an object's own box, turned upright."""
     low, high = _numpy(node.body.shape.bounds().detach().double())
-    x, y, z = float(node.pose.scale) * np.abs(_numpy(node.pose.rotation)).round(3).T @ (high - low)
+    x, y, z = (
+        float(node.pose.scale.detach())
+        * np.abs(_numpy(node.pose.rotation)).round(3).T
+        @ (high - low)
+    )
     return min(x, y), max(x, y), z
 
 

@@ -234,7 +234,7 @@ def parameter_table(scene: "Scene") -> list[dict[str, Any]]:
         {
             "path": f"{node.path}.{name}",
             "shape": " x ".join(map(str, tensor.shape)) or "scalar",
-            "value": f"{float(tensor):.4g}" if tensor.numel() == 1 else "",
+            "value": f"{float(tensor.detach()):.4g}" if tensor.numel() == 1 else "",
         }
         for node in scene.nodes
         for name, tensor in node.body.named_parameters()
@@ -243,7 +243,7 @@ def parameter_table(scene: "Scene") -> list[dict[str, Any]]:
 
 def _node_row(node: Any) -> dict[str, Any]:
     shape, surface = node.body.shape, node.body.surface
-    low, high = _numpy(shape.bounds()) * float(node.pose.scale)
+    low, high = _numpy(shape.bounds()) * float(node.pose.scale.detach())
     config = surface.config() if hasattr(surface, "config") else {}
     return {
         "path": node.path,

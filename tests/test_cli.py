@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,6 +169,23 @@ def test_errors_are_one_sentence_and_a_code(
     assert words in printed.err and "Traceback" not in printed.err
     assert printed.err.count("\n") == 1 and printed.err.startswith("rfsg: ")
     assert not (tmp_path / "o").exists()
+
+
+def test_learn_shape_passes_its_options_on(monkeypatch, tmp_path, capsys):
+    mesh, asked = tmp_path / "thing.obj", {}
+    mesh.write_text("# a mesh\n")
+
+    def learn(mesh_path, asset_path, **options):
+        asked.update(options, mesh=mesh_path, asset=asset_path)
+        options["progress"](1, 5, "surface error 3.00 mm")
+        return SimpleNamespace(surface_mean_mm=1.25, steps=5)
+
+    monkeypatch.setattr("rfsg.learn.geometry.learn_shape_file", learn)
+    options = ["--steps", "5", "--scale", "0.01", "--up", "Y", "--fresh", "--seed", "7"]
+    assert cli.run(["learn-shape", str(mesh), "-o", str(tmp_path / "a.usda"), *options]) == 0
+    assert asked["steps"] == 5 and asked["scale"] == 0.01 and asked["up_axis"] == "y"
+    assert asked["resume"] is False and asked["seed"] == 7 and asked["overwrite"] is False
+    assert "surface_mean_mm" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

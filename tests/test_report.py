@@ -116,3 +116,10 @@ def test_the_scene_table_counts_and_measures(small_run):
     wall, ball = report.scene_table(small_run.scene)
     assert (wall["path"], wall["shape"], wall["surface"]) == ("/World/Wall", "box", "conductor")
     assert wall["size [m]"] == "4 x 0.2 x 3" and ball["at [m]"] == "2 -1 1"
+
+
+def test_the_parameter_table_names_every_tensor(small_run):
+    rows = report.parameter_table(small_run.scene)
+    count = sum(1 for node in small_run.scene.nodes for _ in node.body.parameters())
+    assert len(rows) == count > 0
+    assert all(row["path"].startswith("/World/") for row in rows)
