@@ -185,7 +185,7 @@ def draw_top(axes: Axes, scene: Scene) -> None:
     for node in scene.nodes:
         rings = footprint(node)
         thin, _, tall = _extent(node)
-        thing = _is_thing(node, (high - low)[:2].max())
+        thing = _is_thing(node, float((high - low)[:2].max()))
         for ring in rings:
             color = _THING if thing else _WALL
             patch = Polygon(ring, fill=bool(tall > 0.5 * thin), facecolor=color, zorder=2)
@@ -272,7 +272,7 @@ def _draw_space(axes: Any, scene: Scene) -> None:
         box = corners(node)
         boxy = node.body.shape.kind == "box"
         edges = [box[list(pair)] for pair in _BOX_EDGES] if boxy else slices(node)
-        thing = _is_thing(node, (high - low)[:2].max())
+        thing = _is_thing(node, float((high - low)[:2].max()))
         look: dict[str, Any] = {"linewidths": 0.9 if thing else 0.5, "alpha": 1.0 if thing else 0.5}
         if edges:
             axes.add_collection3d(Line3DCollection(edges, colors=_EDGE, **look))
@@ -321,14 +321,12 @@ def _is_thing(node: Node, scene_size: float) -> bool:
 
 
 def _extent(node: Node) -> tuple[float, float, float]:
-    """Smaller and larger horizontal size and height [m] of an object's own box, turned upright."""
-    low, high = _numpy(node.body.shape.bounds().detach().double())
-    x, y, z = (
-        float(node.pose.scale.detach())
-        * np.abs(_numpy(node.pose.rotation)).round(3).T
-        @ (high - low)
-    )
-    return min(x, y), max(x, y), z
+    """Smaller and larger horizontal side and height [m] of an object's own box."""
+    low, high = _numpy(node.body.shape.bounds())
+    size = (high - low) * float(node.pose.scale.detach())
+    up = int(np.argmax(np.abs(_numpy(node.pose.rotation)[2])))  # its axis nearest to the vertical
+    across = sorted(float(side) for i, side in enumerate(size) if i != up)
+    return across[0], across[1], float(size[up])
 
 
 def _to_world(frame: Pose, ring: np.ndarray, z: float) -> np.ndarray:
