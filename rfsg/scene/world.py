@@ -84,23 +84,32 @@ class World:
     # shapes
 
     def value_and_gradient(
-        self, which: Int[Tensor, "m"], point_world: Float[Tensor, "m 3"]
+        self,
+        which: Int[Tensor, "m"],
+        point_world: Float[Tensor, "m 3"],
+        dtype: torch.dtype = torch.float64,
     ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m 3"]]:
-        """f [m] and its gradient in the world."""
+        """f [m] and its gradient in the world; shapes are asked in ``dtype``, frames stay float64."""
         p = self.point_object(which, point_world)
         value, gradient = p.new_zeros(p.shape[0]), torch.zeros_like(p)
         for body, i in self.groups(which):
-            v, g = body.shape.value_and_gradient(p[i])
-            value, gradient = value.index_copy(0, i, v), gradient.index_copy(0, i, g)
-        return value * self.scale[which].to(p.dtype), self.direction_world(which, gradient)
+            v, g = body.shape.value_and_gradient(p[i].to(dtype))
+            value = value.index_copy(0, i, v.to(p.dtype))
+            gradient = gradient.index_copy(0, i, g.to(p.dtype))
+        return value * self.scale[which], self.direction_world(which, gradient)
 
-    def sdf(self, which: Int[Tensor, "m"], point_world: Float[Tensor, "m 3"]) -> Float[Tensor, "m"]:
-        """f [m]."""
+    def sdf(
+        self,
+        which: Int[Tensor, "m"],
+        point_world: Float[Tensor, "m 3"],
+        dtype: torch.dtype = torch.float64,
+    ) -> Float[Tensor, "m"]:
+        """f [m]; shapes are asked in ``dtype``, frames stay float64."""
         p = self.point_object(which, point_world)
         value = p.new_zeros(p.shape[0])
         for body, i in self.groups(which):
-            value = value.index_copy(0, i, body.shape.sdf(p[i]))
-        return value * self.scale[which].to(p.dtype)
+            value = value.index_copy(0, i, body.shape.sdf(p[i].to(dtype)).to(p.dtype))
+        return value * self.scale[which]
 
     def jet(
         self,

@@ -7,8 +7,9 @@ the same stretch, because the delay already counts it. Differentiable in everyth
 paths: the ends of crossings carry gradients by the implicit function theorem.
 
 Scalars unless a radio is polarised: then complex field vectors in the world frame travel the path and
-each vertex acts by its TE and TM coefficients. The scalar coefficient is (TE + TM) / 2, the co-polar
-coefficient averaged over the orientations of a linear polarisation.
+each vertex acts by its TE and TM coefficients. The scalar coefficient carries the mean power of the
+two and the phase of TE, which is the scalar wave's own (and right at normal and grazing incidence
+alike; an average of the two amplitudes would cancel at grazing, where they differ in sign).
 """
 
 from dataclasses import dataclass
@@ -210,20 +211,36 @@ def _contacts(paths: Paths, u: Tensor, level: int) -> tuple[Tensor, Tensor, Cont
 def _scalar(
     world: World, paths: Paths, through: Passages, u: Tensor, frequency: Tensor
 ) -> Complex[Tensor, "p f"]:
-    """Product of all (TE + TM) / 2."""
+    """Product of all scalar coefficients."""
     shape = (len(paths.tx), len(frequency))
     product = torch.ones(shape, dtype=torch.complex128, device=world.device)
     for level in range(paths.which.shape[1]):
         i, which, contact = _contacts(paths, u, level)
         if len(i):
-            factor = world.reflection(which, contact, frequency).mean(-1)
+            factor = scalar(world.reflection(which, contact, frequency))
             product = product * torch.ones_like(product).index_copy(0, i, factor)
     if len(through.path):
-        factor = world.transmission(through.which, through.crossing, frequency).mean(-1)
+        factor = scalar(world.transmission(through.which, through.crossing, frequency))
         for slot in _slots(through.path):
             i = through.path[slot]
             product = product * torch.ones_like(product).index_copy(0, i, factor[slot])
     return product
+
+
+def scalar(pair: Complex[Tensor, "*b 2"]) -> Complex[Tensor, "*b"]:
+    """One coefficient for an unpolarised link: mean power of (TE, TM), phase of TE."""
+    te, tm = pair[..., 0], pair[..., 1]
+    te_power = te.real**2 + te.imag**2
+    power = 0.5 * (te_power + tm.real**2 + tm.imag**2)
+    dark = te_power < DARK
+    ratio = torch.where(dark, torch.ones_like(power), power / torch.where(dark, 1.0, te_power))
+    # without a TE wave there is no phase to take: the TM share alone, in phase
+    alone = torch.sqrt(torch.where(dark & (power > DARK), power, torch.ones_like(power)))
+    alone = torch.where(dark & (power > DARK), alone, torch.zeros_like(alone)).to(pair.dtype)
+    return torch.where(dark, alone, torch.sqrt(ratio) * te)
+
+
+DARK = 1e-60  # power of -600 dB: nothing
 
 
 def _slots(path: Int[Tensor, "m"]) -> list[Tensor]:

@@ -27,7 +27,7 @@ from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene
 from rfsg.scene.world import World
 from rfsg.tracer.embree import Proxies
-from rfsg.tracer.field import SPEED_OF_LIGHT
+from rfsg.tracer.field import SPEED_OF_LIGHT, scalar
 from rfsg.tracer.launch import (
     LEARNED_LIFT,
     ended_before,
@@ -126,7 +126,7 @@ def _fly(
     inside = crossings(world, rays, proxies.spans(rays), search_options(quality))
     m = len(inside.ray)
     every = torch.arange(m, device=world.device)
-    t = transmission_of(world, rays, inside, every, frequency).mean(-1)[:, 0].abs() ** 2
+    t = scalar(transmission_of(world, rays, inside, every, frequency))[:, 0].abs() ** 2
     r, point, outgoing, front = _reflections(world, rays, inside, frequency)
     if branching == "draw":
         share = torch.where(world.learned_surface[inside.which], 0.5, r / (r + t).clamp(min=1e-300))
@@ -167,7 +167,7 @@ def _reflections(
     i = torch.nonzero(front).squeeze(-1)
     if len(i):
         contact = Contact(point[i], d[i], out[i], normal[i])
-        r[i] = world.reflection(inside.which[i], contact, frequency).mean(-1)[:, 0].abs() ** 2
+        r[i] = scalar(world.reflection(inside.which[i], contact, frequency))[:, 0].abs() ** 2
     scale = torch.maximum(world.size[inside.which], point.abs().amax(-1))
     lift = torch.where(world.exact[inside.which], 1e-12 * scale, LEARNED_LIFT)
     return r, point + lift[:, None] * normal, out, front

@@ -71,12 +71,12 @@ class Facets:
 
 
 def zone_radius(
-    d1: Float[Tensor, "m"],
-    d2: Float[Tensor, "m"],
-    cosine: Float[Tensor, "m"],
-    curvature: Float[Tensor, "m"],
+    d1: Float[Tensor, "*b"],
+    d2: Float[Tensor, "*b"],
+    cosine: Float[Tensor, "*b"],
+    curvature: Float[Tensor, "*b"],
     wavelength: float,
-) -> Float[Tensor, "m"]:
+) -> Float[Tensor, "*b"]:
     """Radius of the first Fresnel zone on a bent surface [m]."""
     tiny = torch.finfo(d1.dtype).tiny
     bend = 1.0 / d1.clamp(min=tiny) + 1.0 / d2.clamp(min=tiny) + 2.0 * curvature * cosine

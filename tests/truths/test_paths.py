@@ -34,6 +34,11 @@ def test_friis(distance, frequency):
     assert abs(h - expected) <= 1e-9 * abs(expected)
 
 
+def _scalar(te, tm):
+    """The documented scalar coefficient: mean power of the two, phase of TE."""
+    return np.sqrt((abs(te) ** 2 + abs(tm) ** 2) / 2) * te / abs(te)
+
+
 def _fresnel(cosine, eps):
     """Textbook Fresnel coefficients (Balanis 2012, section 5.3.1), TM by the magnetic field's sign."""
     root = np.sqrt(eps - (1 - cosine**2) + 0j)
@@ -52,7 +57,7 @@ def test_two_ray_ground(distance):
     result = simulate(Scene((ground,), (radio("/t", *tx),), (radio("/r", *rx),)), 1e9)
     direct, bounced = math.hypot(distance, 8.5), math.hypot(distance, 11.5)
     te, tm = _fresnel(11.5 / bounced, eps)
-    expected = [1 / direct, (te + tm) / 2 / bounced]
+    expected = [1 / direct, _scalar(te, tm) / bounced]
     expected = np.array(expected) * C / 1e9 / (4 * math.pi)
     phase = np.exp(-2j * np.pi * (1e9 / C * np.array([direct, bounced]) % 1.0))
     found = coefficients(result.channel)[:, 0].numpy()
@@ -99,7 +104,7 @@ def _room_images(tx, rx, size, depth):
 
 
 def _slab_reflection(cosine, eps, thickness, frequency):
-    """Scalar (mean of TE and TM) reflection of a single layer: characteristic matrix, Born & Wolf 1.6."""
+    """Scalar reflection of a single layer: characteristic matrix, Born & Wolf 1.6."""
     k0 = 2 * math.pi * frequency / C
     kz = np.sqrt(eps - (1 - cosine**2) + 0j)
     out = []
@@ -110,7 +115,7 @@ def _slab_reflection(cosine, eps, thickness, frequency):
         )
         b, c = m @ np.array([1.0, p0])
         out.append((p0 * b - c) / (p0 * b + c))
-    return (out[0] - out[1]) / 2
+    return _scalar(*out)
 
 
 def test_box_room_to_depth_three():
@@ -203,15 +208,14 @@ def test_slab_transmission_and_delay(angle):
 
     def crossing(f):
         eps = 5.24 - 1j * 0.05 / (2 * math.pi * f * EPS0)
-        t = _slab_transmission(cosine, eps, thickness, f).mean()
+        t = _scalar(*_slab_transmission(cosine, eps, thickness, f))
         return t * np.exp(2j * math.pi * f / C * thickness * cosine)
 
     expected = crossing(frequency) * C / frequency / (4 * math.pi * length)
     assert complex(result.channel.gain[0, 0]) == pytest.approx(expected, rel=1e-6)
     h = 1e4  # [Hz]
     group = -(np.angle(crossing(frequency + h) / crossing(frequency - h))) / (4 * math.pi * h)
-    # the excess of the averaged coefficient against the average of the two: equal to first order
-    assert float(result.channel.delay[0]) - length / C == pytest.approx(group, abs=3e-11)
+    assert float(result.channel.delay[0]) - length / C == pytest.approx(group, rel=1e-4, abs=1e-15)
 
 
 def test_powers_of_both_estimators_agree():
@@ -219,7 +223,7 @@ def test_powers_of_both_estimators_agree():
     from rfsg.tracer.montecarlo import estimate_power
 
     scene = room()
-    quality = Quality(depth=1, map_rays=60_000, floor_db=-200.0)
+    quality = Quality(depth=1, rays=5_000, map_rays=24_000, floor_db=-200.0)
     exact = power(simulate(scene, 2.4e9, quality).channel, 1, 4)[..., 0]
     for branching in ("enumerate", "draw"):
         estimate, error = estimate_power(scene, 2.4e9, quality, radius=0.2, branching=branching)

@@ -63,12 +63,12 @@ class Slab(nn.Module):
     def excess_delay(
         self, shape: Shape, crossing: Crossing, frequency: Float[Tensor, "f"]
     ) -> Float[Tensor, "*b f"]:
-        """Group delay beyond free space [s], the mean of TE and TM."""
+        """Group delay beyond free space [s] of the TE wave, whose phase a scalar link carries."""
         frequency = frequency.to(crossing.start.device, torch.float64)
         cosine = _mean_cosine(crossing).to(torch.float64)[..., None]
         eps, slope = self.medium.permittivity(frequency), self.medium.slope(frequency)
         delay = fresnel.slab_excess_delay(cosine, eps, slope, self.thickness_m, frequency)
-        return delay.mean(-1).to(crossing.start.dtype)
+        return delay[..., 0].to(crossing.start.dtype)
 
     def config(self) -> dict:
         return {"thickness_m": self.thickness_m, **self.medium.config()}
