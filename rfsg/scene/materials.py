@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from rfsg.objects.catalogue import surface_class
-from rfsg.objects.contract import Surface
 
 MODELS = ("conductor", "halfspace", "slab", "stochastic")
 CONSTANTS = ("halfspace", "slab")  # the models that take permittivity and conductivity
@@ -48,8 +47,8 @@ class Material:
             return ["model halfspace has no thickness; use slab"]
         return []
 
-    def surface(self) -> Surface:
-        """Raises ValueError for what the surface's own constructor refuses."""
+    def surface(self) -> Any:
+        """The ``Surface``; ValueError for what its constructor refuses."""
         arguments: dict[str, Any] = {}
         if self.model in CONSTANTS:
             names = ("itu", "eps_r", "sigma", "extrapolate")
@@ -62,7 +61,7 @@ class Material:
         return LOOKS.get(self.itu or self.model, PLAIN_LOOK)
 
 
-def material_of(surface: Surface) -> Material | None:
+def material_of(surface: Any) -> Material | None:
     """The material that gives an equal surface, or None when only a weights file can hold it."""
     if surface.kind not in MODELS or surface.kind == "stochastic":
         return None

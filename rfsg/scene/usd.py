@@ -29,8 +29,17 @@ from rfsg.objects.body import Body
 from rfsg.objects.catalogue import shape_class
 from rfsg.objects.contract import Shape, Surface
 from rfsg.scene import files
-from rfsg.scene.antennas import PATTERNS
-from rfsg.scene.materials import MODELS, Material, material_of
+from rfsg.scene.fields import (
+    FIELDS,
+    FREQUENCY,
+    MATERIAL,
+    NEURAL,
+    RADIO,
+    SHAPE,
+    VELOCITY,
+    Field,
+)
+from rfsg.scene.materials import Material, material_of
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Node, Scene, SceneError
@@ -51,46 +60,6 @@ SCHEMA_FOLDER = Path(__file__).with_name("schema")
 MAX_PRIMS = 200_000
 SHOWN = 12  # paths named in a warning before "and more"
 
-
-@dataclass(frozen=True)
-class Field:
-    """One rfsg attribute: its USD type, the tokens or the sign it may take, its fallback."""
-
-    name: str
-    kind: str
-    tokens: tuple[str, ...] = ()
-    positive: bool = False
-    fallback: Any = None
-
-
-NEURAL = (
-    Field("rfsg:neural:weights", "asset"),
-    Field("rfsg:neural:formatVersion", "int", fallback=FORMAT_VERSION),
-    Field("rfsg:neural:sha256", "string"),
-    Field("rfsg:neural:boundsMin", "float3"),
-    Field("rfsg:neural:boundsMax", "float3"),
-    Field("rfsg:neural:lipschitz", "double", positive=True),
-    Field("rfsg:neural:provenance", "string", fallback="{}"),
-)
-MATERIAL = (
-    Field("rfsg:material:model", "token", tokens=MODELS),
-    Field("rfsg:material:itu", "token"),
-    Field("rfsg:material:epsR", "double", positive=True),
-    Field("rfsg:material:sigma", "double"),
-    Field("rfsg:material:thickness", "double", positive=True),
-    Field("rfsg:material:extrapolate", "bool", fallback=False),
-)
-RADIO = (
-    Field("rfsg:radio:role", "token", tokens=("tx", "rx")),
-    Field("rfsg:radio:powerDbm", "double", fallback=0.0),
-    Field("rfsg:radio:frequencyHz", "double", positive=True),
-    Field("rfsg:radio:pattern", "token", tokens=tuple(PATTERNS), fallback="isotropic"),
-    Field("rfsg:radio:polarization", "token", tokens=("none", "V", "H"), fallback="none"),
-)
-SHAPE = Field("rfsg:shape", "token", tokens=("halfspace",))
-VELOCITY = Field("rfsg:velocity", "double3")
-FREQUENCY = Field("rfsg:frequencyHz", "double", positive=True)
-FIELDS = {f.name: f for f in (*NEURAL, *MATERIAL, *RADIO, SHAPE, VELOCITY, FREQUENCY)}
 
 _TYPES = Sdf.ValueTypeNames
 USD_TYPES = {
@@ -592,7 +561,7 @@ class _Reader:
             attribute = prim.GetAttribute(item.name)
             value = attribute.Get(self.time) if attribute.HasAuthoredValue() else None
             values[item.name] = item.fallback if value is None else _plain(value, item.kind)
-            if value is not None and (amiss := _amiss(item, values[item.name])):
+            if value is not None and (amiss := item.amiss(values[item.name])):
                 faults.append(f"{prim.GetPath()}: {item.name} is {value!r}; expected {amiss}")
         if faults:
             raise SceneError(faults)
@@ -781,21 +750,6 @@ def _plain(value: Any, kind: str) -> Any:
     return value
 
 
-def _amiss(item: Field, value: Any) -> str | None:
-    """What was expected instead of a value, or None."""
-    if item.kind == "double":
-        fine = isinstance(value, float) and bool(np.isfinite(value))
-        fine = fine and (value > 0 or not item.positive)
-        return None if fine else "a finite number" + " > 0" * item.positive
-    if item.kind in ("float3", "double3"):
-        fine = isinstance(value, tuple) and len(value) == 3 and bool(np.isfinite(value).all())
-        return None if fine else "three finite numbers"
-    if item.tokens:
-        return None if value in item.tokens else f"one of {', '.join(item.tokens)}"
-    wanted = {"int": int, "bool": bool}.get(item.kind, str)
-    return None if isinstance(value, wanted) else f"a value of type {item.kind}"
-
-
 def _spec(prim: Usd.Prim) -> Usd.Prim:
     """The prim that holds the opinions: for what lies in an instance, the prototype's."""
     return prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
@@ -835,13 +789,15 @@ def _named(what: str, paths: Sequence[str]) -> str:
 class AssetRecord:
     """What an asset's USD file says, and the object its weights hold.
 
-    referable: a scene in metres, z up, may reference the file as it is."""
+    referable: a scene in metres, z up, may reference the file as it is. portable: the two files
+    are the whole asset, side by side."""
 
     body: Body
     provenance: dict[str, Any]
     weights: str
     sha256: str
     referable: bool
+    portable: bool
 
 
 def read_asset(path: Path) -> AssetRecord:
@@ -866,8 +822,10 @@ def read_asset(path: Path) -> AssetRecord:
         provenance = json.loads(story)
     except (ValueError, RecursionError) as error:
         raise SceneError([f"{where}: rfsg:neural:provenance is not JSON: {error}"]) from error
+    beside = Path(resolved).parent == Path(os.path.realpath(path)).parent
+    portable = beside and not any(layer.GetCompositionAssetDependencies())
     body = unpack(data, f"{path}: {given}")
-    return AssetRecord(body, provenance, resolved, digest(data), referable)
+    return AssetRecord(body, provenance, resolved, digest(data), referable, portable)
 
 
 def write_asset(
@@ -1012,7 +970,8 @@ class _Writer:
         self.stage = _new_stage()
         self.placed: dict[str, np.ndarray] = {}  # world matrices of what stands in the stage
         self.materials: dict[int, UsdShade.Material] = {}  # by identity of the surface
-        self.assets: dict[int, Path] = {}  # by identity of the body
+        self.assets: dict[int | Path, Path] = {}  # by identity of the body, or by the original
+        self.records: dict[str, AssetRecord] = {}
         source = scene.source
         names = source.material_names if isinstance(source, Source) else ()
         self.names = {id(surface): name for surface, name in names}
@@ -1052,7 +1011,7 @@ class _Writer:
         self._place(prim, node.pose, stretch)
         self._velocity(prim, node.velocity)
 
-    def _shape(self, path: str, shape: Shape) -> tuple[Usd.Prim, np.ndarray]:
+    def _shape(self, path: str, shape: Any) -> tuple[Usd.Prim, np.ndarray]:
         """The prim of a known shape, and the stretch that its transform carries (boxes only)."""
         lengths = shape.config()
         prim = self._define(path, _SHAPES[shape.kind])
@@ -1075,21 +1034,23 @@ class _Writer:
     def _asset(self, node: Node, material: Material | None) -> tuple[Path, bool]:
         """(asset file to reference, whether it carries the node's surface)."""
         if node.asset is not None and Path(node.asset).is_file():
-            record = read_asset(Path(node.asset))
+            if node.asset not in self.records:
+                self.records[node.asset] = read_asset(Path(node.asset))
+            record = self.records[node.asset]
             own = same_bits(node.body.surface, record.body.surface)
             same = same_bits(node.body.shape, record.body.shape) and (own or material is not None)
-            if same and record.referable:
-                return self._reachable(Path(node.asset).absolute(), Path(record.weights)), own
+            file = Path(node.asset).absolute()
+            here = not files.outside(str(file), [files.default_root(self.path)])
+            if same and record.referable and (here or record.portable):
+                return file if here else self._copy(file, Path(record.weights)), own
         if id(node.body) not in self.assets:
             file = self._beside(node.path.split("/")[-1])
             write_asset(file, node.body, file.stem, None, {}, (), self.overwrite)
             self.assets[id(node.body)] = file
         return self.assets[id(node.body)], True
 
-    def _reachable(self, asset: Path, weights: Path) -> Path:
-        """The asset, or a copy beside the scene where the scene could not read it back."""
-        if not files.outside(str(asset), [files.default_root(self.path)]):
-            return asset
+    def _copy(self, asset: Path, weights: Path) -> Path:
+        """A copy beside the scene, which could not read the asset where it lies."""
         if asset not in self.assets:
             file = self._beside(asset.stem)
             copies = {file: asset, file.with_name(weights.name): weights}

@@ -36,11 +36,9 @@ _FLOATS = (torch.float32, torch.float64)
 
 def pack(body: Body) -> bytes:
     """The body's architecture and tensors as safetensors bytes; equal bodies give equal bytes."""
-    head = {
-        "formatVersion": FORMAT_VERSION,
-        "shape": {"kind": body.shape.kind, "config": body.shape.config()},
-        "surface": {"kind": body.surface.kind, "config": body.surface.config()},
-    }
+    head: dict[str, Any] = {"formatVersion": FORMAT_VERSION}
+    for part, module in _parts(body):
+        head[part] = {"kind": module.kind, "config": module.config()}
     tensors = {
         f"{part}.{name}": tensor.detach().cpu().contiguous().clone()
         for part, module in _parts(body)
@@ -84,8 +82,8 @@ def digest(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def same_bits(a: nn.Module, b: nn.Module) -> bool:
-    """True when two shapes or two surfaces have one kind, one configuration and equal tensors."""
+def same_bits(a: Any, b: Any) -> bool:
+    """True when two shapes, or two surfaces, have one kind, one configuration and equal tensors."""
     left, right = a.state_dict(), b.state_dict()
     return (
         (a.kind, a.config()) == (b.kind, b.config())
@@ -120,7 +118,7 @@ def refuse_overwrite(paths: list[Path], overwrite: bool) -> None:
         raise SceneError([f"{p}: already exists; pass overwrite=True to replace it" for p in there])
 
 
-def _parts(body: Body) -> tuple[tuple[str, nn.Module], tuple[str, nn.Module]]:
+def _parts(body: Body) -> tuple[tuple[str, Any], tuple[str, Any]]:
     return ("shape", body.shape), ("surface", body.surface)
 
 

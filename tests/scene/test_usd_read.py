@@ -1,6 +1,8 @@
 """What a USD scene means: units, axes, shapes, materials, instances, radios, time."""
 
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -356,6 +358,42 @@ def test_schema_is_registered_and_says_what_the_table_says():
             assert attribute.GetTypeName() == usd.USD_TYPES[item.kind]
             assert attribute.GetFallbackValue() == item.fallback
             assert tuple(attribute.GetMetadata("allowedTokens") or ()) == item.tokens
+
+
+def test_a_late_registration_is_said_once_and_scenes_are_read_all_the_same(scene_file):
+    path = scene_file(cube())
+    script = f"""
+import warnings
+from pxr import Usd
+Usd.SchemaRegistry()
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    from rfsg.scene.scene import Scene
+    scene = Scene.from_usd({str(path)!r})
+print(len(scene.nodes), [str(w.message)[:36] for w in caught])
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout.strip() == '1 ["rfsg\'s USD schema came too late: pxr"]', done.stderr
+    assert done.stderr == ""
+
+
+def test_a_package_is_read_like_files(scene_file, asset_here, tmp_path):
+    from pxr import UsdUtils
+
+    path = scene_file(reference("A", "instanceable = true") + reference("B"))
+    package = tmp_path / "packed" / "scene.usdz"
+    package.parent.mkdir()
+    assert UsdUtils.CreateNewUsdzPackage(str(path), str(package))
+    a, b = Scene.from_usd(package).nodes
+    assert a.body is b.body and a.body.shape.kind == "neural"
+
+
+def test_a_file_that_changed_is_read_as_it_is_now(scene_file):
+    path = scene_file(cube())
+    with pytest.raises(SceneError) as kept:  # holds the frames of the first read
+        Scene.from_usd(scene_file('def PointInstancer "P" {}'))
+    assert len(Scene.from_usd(scene_file(cube("A") + cube("B"))).nodes) == 2
+    assert kept.value.faults and path.exists()
 
 
 def test_device_is_followed(scene_file):

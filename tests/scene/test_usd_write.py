@@ -121,6 +121,24 @@ def test_assets_are_referenced_where_they_lie_and_copied_from_elsewhere(
     assert_same(Scene.from_usd(far), scene)
 
 
+def test_an_asset_of_several_files_is_saved_anew_elsewhere(scene_file, asset_here, tmp_path):
+    """A copy of two files would be torn: the layer below names its weights in another folder."""
+    (tmp_path / "deep").mkdir()
+    asset_here.rename(tmp_path / "deep" / "cabinet.usda")
+    text = (tmp_path / "deep" / "cabinet.usda").read_text()
+    (tmp_path / "deep" / "cabinet.usda").write_text(text.replace("@./", "@../"))
+    # the file above its folder is outside what the asset alone may read: a marker lets it
+    (tmp_path / "rfsg-assets.toml").touch()
+    body = (
+        'def Xform "A" (\n        prepend references = @./deep/cabinet.usda@\n    )\n    {\n    }\n'
+    )
+    scene = Scene.from_usd(scene_file(body))
+    (tmp_path / "far").mkdir()
+    (tmp_path / "far" / "rfsg-assets.toml").touch()
+    far = scene.to_usd(tmp_path / "far" / "far.usda")
+    assert_same(Scene.from_usd(far), scene)
+
+
 def test_a_fit_is_saved_beside_and_the_asset_stays(scene_file, asset_here, tmp_path):
     body = 'def Xform "A" (\n        prepend references = @./cabinet.usda@\n    )\n    {\n    }\n'
     scene = Scene.from_usd(scene_file(body))

@@ -1,0 +1,67 @@
+"""The attributes of rfsg in USD: one table of names, types, what they may hold, and fallbacks.
+
+``schema/generatedSchema.usda`` tells other programs the same; a test compares the two.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+from rfsg.scene.antennas import PATTERNS
+from rfsg.scene.materials import MODELS
+from rfsg.scene.weights import FORMAT_VERSION
+
+
+@dataclass(frozen=True)
+class Field:
+    """One attribute: its USD type, the tokens or the sign it may take, its fallback."""
+
+    name: str
+    kind: str
+    tokens: tuple[str, ...] = ()
+    positive: bool = False
+    fallback: Any = None
+
+    def amiss(self, value: Any) -> str | None:
+        """What was expected instead of a value, or None when it is in order."""
+        if self.kind == "double":
+            fine = isinstance(value, float) and math.isfinite(value)
+            fine = fine and (value > 0 or not self.positive)
+            return None if fine else "a finite number" + " > 0" * self.positive
+        if self.kind in ("float3", "double3"):
+            fine = isinstance(value, tuple) and len(value) == 3 and all(map(math.isfinite, value))
+            return None if fine else "three finite numbers"
+        if self.tokens:
+            return None if value in self.tokens else f"one of {', '.join(self.tokens)}"
+        wanted = {"int": int, "bool": bool}.get(self.kind, str)
+        return None if isinstance(value, wanted) else f"a value of type {self.kind}"
+
+
+NEURAL = (
+    Field("rfsg:neural:weights", "asset"),
+    Field("rfsg:neural:formatVersion", "int", fallback=FORMAT_VERSION),
+    Field("rfsg:neural:sha256", "string"),
+    Field("rfsg:neural:boundsMin", "float3"),
+    Field("rfsg:neural:boundsMax", "float3"),
+    Field("rfsg:neural:lipschitz", "double", positive=True),
+    Field("rfsg:neural:provenance", "string", fallback="{}"),
+)
+MATERIAL = (
+    Field("rfsg:material:model", "token", tokens=MODELS),
+    Field("rfsg:material:itu", "token"),
+    Field("rfsg:material:epsR", "double", positive=True),
+    Field("rfsg:material:sigma", "double"),
+    Field("rfsg:material:thickness", "double", positive=True),
+    Field("rfsg:material:extrapolate", "bool", fallback=False),
+)
+RADIO = (
+    Field("rfsg:radio:role", "token", tokens=("tx", "rx")),
+    Field("rfsg:radio:powerDbm", "double", fallback=0.0),
+    Field("rfsg:radio:frequencyHz", "double", positive=True),
+    Field("rfsg:radio:pattern", "token", tokens=tuple(PATTERNS), fallback="isotropic"),
+    Field("rfsg:radio:polarization", "token", tokens=("none", "V", "H"), fallback="none"),
+)
+SHAPE = Field("rfsg:shape", "token", tokens=("halfspace",))
+VELOCITY = Field("rfsg:velocity", "double3")
+FREQUENCY = Field("rfsg:frequencyHz", "double", positive=True)
+FIELDS = {f.name: f for f in (*NEURAL, *MATERIAL, *RADIO, SHAPE, VELOCITY, FREQUENCY)}
