@@ -405,13 +405,16 @@ class _Reader:
         """USD converts neither units nor axes across references: refuse, naming what to add."""
         if not (prim.HasAuthoredReferences() or prim.HasAuthoredPayloads()):
             return
+        if not any(p.IsA(UsdGeom.Xformable) for p in Usd.PrimRange(prim)):
+            return  # a library of materials has no size and no up
+        xform = UsdGeom.Xformable(prim)
+        local = np.array(xform.GetLocalTransformation(self.time)).T if xform else np.eye(4)
         for arc in Usd.PrimCompositionQuery(_spec(prim)).GetCompositionArcs():
             if arc.IsAncestral() or arc.GetArcType() not in _REFERENCES:
                 continue
             outer, inner = _layer(arc.GetIntroducingNode()), _layer(arc.GetTargetNode())
             if outer is None or inner is None or outer == inner:
                 continue
-            local = np.array(UsdGeom.Xformable(prim).GetLocalTransformation(self.time)).T
             self._same_metre(prim, local, inner, outer)
             self._same_up(prim, local, inner, outer)
 
@@ -420,7 +423,7 @@ class _Reader:
         if mine is None or theirs is None or mine <= 0 or np.isclose(mine, theirs, rtol=TOLERANCE):
             return
         ratio = theirs / mine
-        scales = np.linalg.norm(local[:3, :3], axis=0) if local.shape == (4, 4) else np.ones(3)
+        scales = np.linalg.norm(local[:3, :3], axis=0)
         if not np.allclose(scales, ratio, rtol=TOLERANCE):
             self.faults.append(
                 f"{prim.GetPath()}: references {inner.realPath}, whose metersPerUnit is {theirs:g} "
@@ -432,8 +435,9 @@ class _Reader:
         if mine is None or theirs is None or mine == theirs or {mine, theirs} - {"Y", "Z"}:
             return
         axis = {"Y": np.array([0, 1.0, 0]), "Z": np.array([0, 0, 1.0])}
-        turned = local[:3, :3] @ axis[theirs] if local.shape == (4, 4) else axis[theirs]
-        if not np.allclose(turned / np.linalg.norm(turned), axis[mine], atol=TOLERANCE):
+        turned = local[:3, :3] @ axis[theirs]
+        length = np.linalg.norm(turned)
+        if not np.allclose(turned, length * axis[mine], atol=TOLERANCE * length):
             self.faults.append(
                 f"{prim.GetPath()}: references {inner.realPath}, whose upAxis is {theirs} (here "
                 f"{mine}); add rotateX = {90 if theirs == 'Y' else -90} on this prim"
@@ -907,7 +911,7 @@ def _weights_path(prim: Usd.Prim, roots: Sequence[Path], where: str) -> tuple[st
     """(resolved path, path as given) of a prim's weights, which may be read."""
     value = prim.GetAttribute("rfsg:neural:weights").Get()
     if isinstance(value, Sdf.AssetPath):
-        given, anchored = value.path, value.resolvedPath or value.path
+        given, anchored = value.path, value.resolvedPath
     else:  # Blender's round trip turns asset paths into strings, without their anchor
         given = str(value or "")
         anchored = prim.GetStage().GetRootLayer().ComputeAbsolutePath(given) if given else ""

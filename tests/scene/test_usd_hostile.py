@@ -270,6 +270,18 @@ def test_weights_that_may_not_be_read(tmp_path, scene_file, small_asset, path, e
     assert fault.startswith("/World/Net: weights ") and expected in fault
 
 
+def test_weights_are_never_looked_for_in_the_working_folder(
+    scene_file, asset_here, tmp_path, monkeypatch
+):
+    body = neural("./cabinet.safetensors", "0" * 64)
+    path = scene_file(body, name="scene.usda")
+    (tmp_path / "deep").mkdir()
+    path = path.rename(tmp_path / "deep" / "scene.usda")
+    monkeypatch.chdir(tmp_path)  # holds a file of that name
+    (fault,) = faults_of(path, asset_roots=[tmp_path])
+    assert "not found" in fault
+
+
 def test_a_newer_format_version(scene_file, asset_here):
     body = neural("./cabinet.safetensors", extra="custom int rfsg:neural:formatVersion = 2")
     (fault,) = faults_of(scene_file(body))

@@ -244,6 +244,31 @@ def test_a_centimetre_scene_needs_the_scale_that_the_fault_names(scene_file, ass
     torch.testing.assert_close(pose.translation, real(1.5, 0, 0))
 
 
+@pytest.mark.parametrize("kind", ["Scope", "Xform"])
+def test_a_material_library_has_no_units(scene_file, tmp_path, kind):
+    (tmp_path / "looks.usda").write_text(f"""#usda 1.0
+(
+    defaultPrim = "Looks"
+    metersPerUnit = 1
+    upAxis = "Z"
+)
+def Scope "Looks"
+{{
+    def {kind} "Inside"
+    {{
+    }}
+}}
+""")
+    body = 'def "Looks" (\n        prepend references = @./looks.usda@\n    )\n    {\n    }\n'
+    path = scene_file(body, metre=0.01, up="Y")
+    if kind == "Scope":
+        assert Scene.from_usd(path).nodes == ()
+    else:
+        with pytest.raises(SceneError) as error:
+            Scene.from_usd(path)
+        assert [f.split(":")[0] for f in error.value.faults] == ["/World/Looks"] * 2
+
+
 def test_a_y_up_scene_needs_the_turn_that_the_fault_names(scene_file, asset_here):
     with pytest.raises(SceneError, match="/World/A: .*upAxis is Z .*add rotateX = -90"):
         Scene.from_usd(scene_file(reference("A"), up="Y"))
