@@ -16,11 +16,16 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.optimize
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
+
+if TYPE_CHECKING:
+    from rfsg.scene.scene import Scene
+    from rfsg.tracer.plan import Quality
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "assets" / "scenes" / "tetam_lab.usda"
@@ -298,7 +303,7 @@ def picture(
         gains = sensor_gains(links, predicted, train)
         said[name] = measured - errors(links, predicted, gains, test)
     path.parent.mkdir(parents=True, exist_ok=True)
-    save(comparison_figure(measured, said, title=f"tetam-ble, {path.stem}"), path)
+    save(comparison_figure(measured, said, title=path.stem.replace("_", " ")), path)
 
 
 def pictures(links: Links, predictors: dict[str, Float[ndarray, "l"]], folder: Path) -> None:

@@ -1,18 +1,21 @@
 """The scene asks its objects' questions, by index, in the world frame.
 
-World-to-object happens here and nowhere else, and so does grouping a batch by object: points of all
-nodes that share a body go to that body in one call. Frames are float64 always; a shape may be asked in float32.
+World-to-object happens here and nowhere else, and so does grouping a batch: points of all nodes
+that share a shape or a surface go to it in one call. Frames are float64 always; a shape may be asked in float32.
 """
 
+import json
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
 from rfsg.objects.body import Body
-from rfsg.objects.contract import Contact, Crossing, Jet
-from rfsg.scene.scene import Node, Scene
+from rfsg.objects.contract import Contact, Crossing, Jet, Shape
+from rfsg.objects.shapes.analytic import Box, Boxes
+from rfsg.scene.scene import Scene
 
 
 class World:
@@ -26,7 +29,16 @@ class World:
         self.translation = _stack([n.pose.translation for n in nodes], (3,), self.device)
         self.scale = _stack([n.pose.scale for n in nodes], (), self.device)
         self.velocity = _stack([n.velocity for n in nodes], (3,), self.device)
-        self.bodies, self.body_of_node = _distinct_bodies(nodes, self.device)
+        for body in {id(n.body): n.body for n in nodes}.values():
+            body.to(self.device)
+        self.shapes, self.shape_of_node = _distinct([_shape_key(n.body) for n in nodes], self.device)
+        self.surfaces, self.surface_of_node = _distinct(
+            [_surface_key(n.body) for n in nodes], self.device
+        )
+        boxes = [n.body.shape for n in nodes if isinstance(n.body.shape, Box)]
+        self.half_size = _stack([b.half_size for b in boxes], (3,), self.device)
+        is_box = torch.tensor([isinstance(n.body.shape, Box) for n in nodes], device=self.device)
+        self.box_of_node = torch.cumsum(is_box.long(), 0) - 1
         self.bounds_object = _stack([n.body.shape.bounds() for n in nodes], (2, 3), self.device)
         self.exact = self._flags(lambda b: b.shape.exact)
         self.convex = self._flags(lambda b: b.shape.convex)
@@ -46,11 +58,22 @@ class World:
         answers = [bool(question(n.body)) for n in self.scene.nodes]
         return torch.tensor(answers, dtype=torch.bool, device=self.device)
 
-    def groups(self, which: Int[Tensor, "m"]) -> Iterator[tuple[Body, Tensor]]:
-        """(body, positions in the batch) for every body that the batch touches."""
-        owner = self.body_of_node[which]
-        for b in torch.unique(owner).tolist():
-            yield self.bodies[b], torch.nonzero(owner == b).squeeze(-1)
+    def groups(self, which: Int[Tensor, "m"]) -> Iterator[tuple[Shape, Tensor]]:
+        """(shape, positions in the batch) for every shape that the batch touches.
+
+        All boxes of a scene come as one ``Boxes``, a row for each of their positions.
+        """
+        owner = self.shape_of_node[which]
+        for k in torch.unique(owner).tolist():
+            i = torch.nonzero(owner == k).squeeze(-1)
+            shape = self.shapes[k]
+            yield (Boxes(self.half_size[self.box_of_node[which[i]]]) if shape is None else shape), i
+
+    def surface_groups(self, which: Int[Tensor, "m"]) -> Iterator[tuple[Body, Tensor]]:
+        """(body, positions in the batch) for every surface; equal known materials are one."""
+        owner = self.surface_of_node[which]
+        for k in torch.unique(owner).tolist():
+            yield self.surfaces[k], torch.nonzero(owner == k).squeeze(-1)
 
     # frames
 
@@ -92,8 +115,8 @@ class World:
         """f [m] and its gradient in the world; shapes are asked in ``dtype``, frames stay float64."""
         p = self.point_object(which, point_world)
         value, gradient = p.new_zeros(p.shape[0]), torch.zeros_like(p)
-        for body, i in self.groups(which):
-            v, g = body.shape.value_and_gradient(p[i].to(dtype))
+        for shape, i in self.groups(which):
+            v, g = shape.value_and_gradient(p[i].to(dtype))
             value = value.index_copy(0, i, v.to(p.dtype))
             gradient = gradient.index_copy(0, i, g.to(p.dtype))
         return value * self.scale[which], self.direction_world(which, gradient)
@@ -107,8 +130,8 @@ class World:
         """f [m]; shapes are asked in ``dtype``, frames stay float64."""
         p = self.point_object(which, point_world)
         value = p.new_zeros(p.shape[0])
-        for body, i in self.groups(which):
-            value = value.index_copy(0, i, body.shape.sdf(p[i].to(dtype)).to(p.dtype))
+        for shape, i in self.groups(which):
+            value = value.index_copy(0, i, shape.sdf(p[i].to(dtype)).to(p.dtype))
         return value * self.scale[which]
 
     def jet(
@@ -121,8 +144,8 @@ class World:
         p = self.point_object(which, point_world)
         value, gradient = p.new_zeros(p.shape[0]), torch.zeros_like(p)
         hessian = p.new_zeros(p.shape[0], 3, 3)
-        for body, i in self.groups(which):
-            j = body.shape.jet(p[i].to(dtype))
+        for shape, i in self.groups(which):
+            j = shape.jet(p[i].to(dtype))
             value = value.index_copy(0, i, j.value.to(p.dtype))
             gradient = gradient.index_copy(0, i, j.gradient.to(p.dtype))
             hessian = hessian.index_copy(0, i, j.hessian.to(p.dtype))
@@ -136,9 +159,9 @@ class World:
         """Outward unit normals at surface points; zero where the gradient vanishes."""
         p = self.point_object(which, point_world)
         normal = torch.zeros_like(p)
-        for body, i in self.groups(which):
-            own = getattr(body.shape, "normal_at", None)
-            n = own(p[i]) if own else unit(body.shape.value_and_gradient(p[i])[1])
+        for shape, i in self.groups(which):
+            own = getattr(shape, "normal_at", None)
+            n = own(p[i]) if own else unit(shape.value_and_gradient(p[i])[1])
             normal = normal.index_copy(0, i, n)
         return self.direction_world(which, normal)
 
@@ -146,8 +169,8 @@ class World:
         """Which smooth piece of its object's surface each point lies on."""
         p = self.point_object(which, point_world)
         patch = torch.zeros_like(which)
-        for body, i in self.groups(which):
-            patch[i] = body.shape.patch(p[i]).to(patch.dtype)
+        for shape, i in self.groups(which):
+            patch[i] = shape.patch(p[i]).to(patch.dtype)
         return patch
 
     def interval(
@@ -159,8 +182,8 @@ class World:
         """Closed-form (enter, leave) [m] of whole lines through convex nodes; (inf, -inf) for a miss."""
         o, d = self.point_object(which, origin), self.direction_object(which, direction)
         enter, leave = o.new_zeros(o.shape[0]), o.new_zeros(o.shape[0])
-        for body, i in self.groups(which):
-            a, b = body.shape.interval(o[i], d[i])
+        for shape, i in self.groups(which):
+            a, b = shape.interval(o[i], d[i])
             enter, leave = enter.index_copy(0, i, a), leave.index_copy(0, i, b)
         scale = self.scale[which].to(o.dtype)
         return enter * scale, leave * scale
@@ -171,12 +194,15 @@ class World:
         """Planar patches in the world: normal, offset d of n.x = d, and whether the patch is planar."""
         normal = torch.zeros(which.shape[0], 3, dtype=torch.float64, device=self.device)
         offset, planar = normal[:, 0].clone(), torch.zeros_like(which, dtype=torch.bool)
-        for body, i in self.groups(which):
-            rows = body.shape.planes().to(torch.float64)
-            flat = patch[i] < rows.shape[0]
-            j = i[flat]
-            normal = normal.index_copy(0, j, rows[patch[j], :3])
-            offset = offset.index_copy(0, j, rows[patch[j], 3])
+        for shape, i in self.groups(which):
+            if isinstance(shape, Boxes):
+                j, rows = i, shape.plane_of(patch[i])
+            else:
+                table = shape.planes().to(torch.float64)
+                j = i[patch[i] < table.shape[0]]
+                rows = table[patch[j]]
+            normal = normal.index_copy(0, j, rows[:, :3])
+            offset = offset.index_copy(0, j, rows[:, 3])
             planar[j] = True
         normal = self.direction_world(which, normal)
         place = (normal * self.translation[which]).sum(-1)
@@ -195,7 +221,7 @@ class World:
             self.direction_object(which, contact.normal),
         )
         out = _complex(which, frequency)
-        for body, i in self.groups(which):
+        for body, i in self.surface_groups(which):
             mine = Contact(local.point[i], local.incoming[i], local.outgoing[i], local.normal[i])
             out = out.index_copy(0, i, body.reflection(mine, frequency).to(out.dtype))
         return out
@@ -206,7 +232,7 @@ class World:
         """Transmission (TE, TM) relative to free space, of crossings given in the world."""
         out = _complex(which, frequency)
         local = self._crossing_object(which, crossing)
-        for body, i in self.groups(which):
+        for body, i in self.surface_groups(which):
             out = out.index_copy(0, i, body.transmission(_take(local, i), frequency).to(out.dtype))
         return out
 
@@ -216,7 +242,7 @@ class World:
         """Group delay beyond free space [s], of crossings given in the world."""
         out = torch.zeros(len(which), len(frequency), dtype=torch.float64, device=self.device)
         local = self._crossing_object(which, crossing)
-        for body, i in self.groups(which):
+        for body, i in self.surface_groups(which):
             out = out.index_copy(0, i, body.excess_delay(_take(local, i), frequency).to(out.dtype))
         return out
 
@@ -254,15 +280,28 @@ def _stack(items: list[Tensor], shape: tuple[int, ...], device: torch.device) ->
     return torch.stack([x.to(device=device, dtype=torch.float64) for x in items])
 
 
-def _distinct_bodies(
-    nodes: tuple[Node, ...], device: torch.device
-) -> tuple[list[Body], Int[Tensor, "n"]]:
-    bodies: list[Body] = []
-    index: dict[int, int] = {}
-    owner = []
-    for node in nodes:
-        if id(node.body) not in index:
-            index[id(node.body)] = len(bodies)
-            bodies.append(node.body.to(device))
-        owner.append(index[id(node.body)])
-    return bodies, torch.tensor(owner, dtype=torch.int64, device=device)
+def _distinct(
+    keyed: list[tuple[object, Any]], device: torch.device
+) -> tuple[list[Any], Int[Tensor, "n"]]:
+    """Things that share a key, once each, and which of them every node has."""
+    index: dict[object, int] = {}
+    things, owner = [], []
+    for key, thing in keyed:
+        if key not in index:
+            index[key] = len(things)
+            things.append(thing)
+        owner.append(index[key])
+    return things, torch.tensor(owner, dtype=torch.int64, device=device)
+
+
+def _shape_key(body: Body) -> tuple[object, Shape | None]:
+    return ("boxes", None) if isinstance(body.shape, Box) else (id(body.shape), body.shape)
+
+
+def _surface_key(body: Body) -> tuple[object, Body]:
+    """Known materials of equal constants answer alike; a learned one belongs to its shape."""
+    surface = body.surface
+    learned = surface.kind == "stochastic" or any(p.requires_grad for p in surface.parameters())
+    if learned:
+        return (id(surface), id(body.shape)), body
+    return (surface.kind, json.dumps(surface.config(), sort_keys=True)), body

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from rfsg.objects.body import Body
 from rfsg.objects.contract import Shape
 from rfsg.scene.world import World
 from rfsg.tracer.embree import sort_by
@@ -95,8 +94,8 @@ def _learned(
     start = origin + (spans.enter / scale)[:, None] * direction
     length = (spans.leave - spans.enter) / scale
     found = []
-    for body, i in world.groups(which):
-        row, t_in, t_out = march(body, start[i], direction[i], length[i], options)
+    for shape, i in world.groups(which):
+        row, t_in, t_out = march(shape, start[i], direction[i], length[i], options)
         k = i[row]
         enter = spans.enter[k] + t_in * scale[k]
         leave = spans.enter[k] + t_out * scale[k]
@@ -106,7 +105,7 @@ def _learned(
 
 
 def march(
-    body: Body,
+    shape: Shape,
     start: Float[Tensor, "m 3"],
     direction: Float[Tensor, "m 3"],
     length: Float[Tensor, "m"],
@@ -116,7 +115,6 @@ def march(
 
     Steps are max(|f| / L, step_floor): with L a true bound none skips anything thicker than the floor.
     """
-    shape = body.shape
     dtype = options.dtype
     p0, d, end = start.to(dtype), direction.to(dtype), length.to(dtype)
     t = torch.zeros_like(end)

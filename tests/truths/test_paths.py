@@ -227,6 +227,6 @@ def test_powers_of_both_estimators_agree():
     exact = power(simulate(scene, 2.4e9, quality).channel, 1, 4)[..., 0]
     for branching in ("enumerate", "draw"):
         estimate, error = estimate_power(scene, 2.4e9, quality, radius=0.2, branching=branching)
-        assert bool((error < 0.1 * exact).all())
+        assert bool((error < 0.2 * exact).all())  # enough rays for the comparison to mean something
         # four standard errors, and the mean of 1/r^2 over a 0.2 m sphere about the centre
         assert bool(((estimate - exact).abs() < 4 * error + 0.02 * exact).all())
