@@ -93,6 +93,10 @@ def _unsafe_package(path: str) -> str | None:
 
 
 def _unsafe_text(text: bytes) -> str | None:
+    try:
+        text.decode()
+    except UnicodeDecodeError as error:
+        return f"not UTF-8 text: byte {error.start}"
     depth = 0
     for match in _TOKENS.finditer(text):
         depth += {b"{": 1, b"}": -1}.get(match[0], 0)

@@ -116,9 +116,10 @@ def read(
 
     Raises SceneError listing all faults. Only files that may not be opened, or cannot be parsed,
     are listed on their own, before composition. Untrusted scenes belong into a child process with
-    limits on time and memory: nothing in one process can bound what composition takes.
+    limits on time and memory: nothing in one process can bound what composition takes, and OpenUSD
+    itself may print lines of its own about a damaged binary layer.
     """
-    with _quiet():
+    with _quiet(path):
         reader = _Reader.open(Path(path), variants or {}, asset_roots, time, device)
         scene, faults = reader.scene(), reader.faults
         del reader  # a traceback that somebody keeps must not keep the stage open
@@ -133,20 +134,21 @@ def check(path: str | Path, **options: Any) -> list[str]:
     from pxr import UsdValidation
 
     options = {"variants": {}, "asset_roots": (), "time": None, "device": "cpu"} | options
-    with _quiet():
-        try:
+    faults: list[str] = []
+    try:
+        with _quiet(path):
             reader = _Reader.open(Path(path), **options)
-        except SceneError as error:
-            return list(error.faults)
-        reader.scene()
-        validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
-        found = UsdValidation.ValidationContext(validators).Validate(reader.stage)
-        # what does not compose or resolve is among the reader's faults, with its prim
-        own = {"CompositionError", "UnresolvableDependency"} if reader.faults else set()
-        named = [_finding(e, str(path)) for e in found if e.GetName() not in own]
-        faults = list(dict.fromkeys([*reader.faults, *named]))
-        del found
-    return faults
+            reader.scene()
+            faults += reader.faults
+            validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+            found = UsdValidation.ValidationContext(validators).Validate(reader.stage)
+            # what does not compose or resolve is among the reader's faults, with its prim
+            own = {"CompositionError", "UnresolvableDependency"} if faults else set()
+            faults += [_finding(e, str(path)) for e in found if e.GetName() not in own]
+            del found
+    except SceneError as error:
+        faults += error.faults
+    return list(dict.fromkeys(faults))
 
 
 def _finding(error: Any, file: str) -> str:
@@ -156,11 +158,14 @@ def _finding(error: Any, file: str) -> str:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Hold pxr's diagnostics: what matters is said again as faults, with prim paths."""
+def _quiet(path: str | Path) -> Iterator[None]:
+    """Hold pxr's diagnostics: what matters is said again as faults, with prim paths. What pxr
+    raises where nobody expects it (a corrupt crate, say) becomes a fault of the file."""
     delegate = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         yield
+    except _PXR_ERRORS as error:
+        raise SceneError([f"{path}: {_pxr_words(error)}"]) from error
     finally:
         delegate.TakeUncoalescedDiagnostics()
         del delegate
@@ -175,10 +180,7 @@ def _open(path: Path, roots: Sequence[Path]) -> Usd.Stage:
     layers = _safe_layers(path, roots, faults)
     if faults:
         raise SceneError(faults)
-    try:
-        return Usd.Stage.Open(layers[0], Sdf.Layer.CreateAnonymous("session.usda"))
-    except Tf.ErrorException as error:
-        raise SceneError([f"{path}: {_pxr_words(error)}"]) from error
+    return Usd.Stage.Open(layers[0], Sdf.Layer.CreateAnonymous("session.usda"))
 
 
 def _safe_layers(path: Path, roots: Sequence[Path], faults: list[str]) -> list[Sdf.Layer]:
@@ -191,7 +193,7 @@ def _safe_layers(path: Path, roots: Sequence[Path], faults: list[str]) -> list[S
         reason = files.unsafe_layer(file)
         try:
             layer = None if reason else _current(file)
-        except Tf.ErrorException as error:
+        except _PXR_ERRORS as error:
             layer, reason = None, _pxr_words(error)
         if layer is None:
             faults.append(f"{file}: {reason or 'cannot be opened'}")
@@ -242,9 +244,16 @@ def _users(layer: Sdf.Layer, given: str) -> str:
     return users[0] if users else ""
 
 
-def _pxr_words(error: Tf.ErrorException) -> str:
+# the second comes of strings in binary layers that are not UTF-8
+_PXR_ERRORS = (Tf.ErrorException, UnicodeDecodeError)
+
+
+def _pxr_words(error: Exception) -> str:
     """The message of a pxr exception without the names of its C++ functions."""
-    text = str(error).strip()
+    try:
+        text = str(error).strip()
+    except UnicodeDecodeError:
+        return "OpenUSD refuses it, in words that are not UTF-8"
     return _one_line(text.split(" : '", 1)[-1].rstrip("'\n ") if " : '" in text else text)
 
 
@@ -306,7 +315,7 @@ class _Reader:
                     step(prim)
                 except SceneError as error:
                     self.faults += error.faults
-                except Tf.ErrorException as error:
+                except _PXR_ERRORS as error:
                     self.faults.append(f"{prim.GetPath()}: {_pxr_words(error)}")
         self.faults = list(dict.fromkeys(self.faults))
         if self.decor:
@@ -809,7 +818,7 @@ def read_asset(path: Path) -> AssetRecord:
 
     Raises SceneError listing every fault."""
     roots = (files.default_root(path),)
-    with _quiet():
+    with _quiet(path):
         stage = _open(path, roots)
         root = stage.GetDefaultPrim()
         found = [p for p in stage.Traverse() if p.GetAttribute(NEURAL[0].name).HasAuthoredValue()]
@@ -959,7 +968,7 @@ def write(scene: Scene, path: str | Path, overwrite: bool = False) -> Path:
     if path.suffix != ".usda":
         raise SceneError([f"{path}: scenes are written as text; expected the ending .usda"])
     refuse_overwrite([path], overwrite)
-    with _quiet():
+    with _quiet(path):
         writer = _Writer(scene, path, overwrite)
         writer.run()
         text = writer.stage.GetRootLayer().ExportToString()

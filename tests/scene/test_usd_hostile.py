@@ -1,6 +1,7 @@
 """Hostile and broken scenes: every fault at once, each with its prim path, nothing on stderr."""
 
 import json
+import random
 import shutil
 
 import pytest
@@ -143,7 +144,7 @@ def test_missing_units_are_a_fault(tmp_path):
     [
         ("none.usda", None, "there is no such file"),
         ("empty.usda", b"", ""),
-        ("junk.usda", b"\x00\xff junk", ""),
+        ("junk.usda", b"\x00\xff junk", "not UTF-8 text: byte 1"),
         ("junk.usdc", b"PXR-USDC but no more", ""),
         ("junk.usdz", b"PK\x03\x04 but no more", "not a package"),
         ("scene.txt", b"#usda 1.0\n", "not a USD file"),
@@ -333,3 +334,26 @@ def test_tensors_that_are_not_the_declared_architecture(scene_file, tmp_path, sm
     ):
         (fault,) = net_faults(scene_file, tmp_path, with_tensors(data, change))
         assert expected in fault
+
+
+def test_random_damage_is_a_scene_error_or_a_scene(scene_file, tmp_path, capfd):
+    """Bytes changed, lost and added in text and in binary layers: nothing else comes
+    out, and of text nothing on stderr (the reader of binary layers has prints of its own)."""
+    from pxr import Sdf
+
+    text = scene_file(cube())
+    Sdf.Layer.FindOrOpen(str(text)).Export(str(tmp_path / "scene.usdc"))
+    draw = random.Random(0)
+    for original in (text, tmp_path / "scene.usdc"):
+        for i in range(40):
+            data = bytearray(original.read_bytes())
+            for _ in range(draw.choice([1, 5])):
+                k = draw.randrange(len(data))
+                data[k : k + draw.choice([0, 1, 9])] = draw.randbytes(draw.choice([0, 1, 9]))
+            path = tmp_path / f"damaged_{i}{original.suffix}"
+            path.write_bytes(data)
+            try:
+                Scene.from_usd(path)
+            except SceneError as error:
+                assert all("\n" not in fault for fault in error.faults)
+        assert original.suffix == ".usdc" or capfd.readouterr() == ("", "")
