@@ -39,7 +39,7 @@ from rfsg.scene.weights import refuse_overwrite
 MAX_BYTES = 512 * 2**20
 MAX_TRIANGLES = 5_000_000
 MARGIN, LEAST_MARGIN = 0.05, 0.03  # bounds beyond the mesh: share of its size, or metres if more
-STEPS = 6_000
+STEPS = 3_000
 NEAR_BATCH, FAR_BATCH = 512, 256  # smaller batches and more steps learned better per second
 NEAR_POOL, FAR_POOL = 100_000, 50_000
 CHECKPOINT_EVERY = 200

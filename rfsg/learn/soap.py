@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 MOMENTUM, MEMORY = 0.95, 0.95
 REFRESH = 10  # steps between updates of the eigenbases
-TINY = 1e-12  # below any second moment that matters; keeps a dead weight from dividing by zero
+TINY = 1e-8  # directions without gradient yet must not move: they would undo the start
 
 
 class Soap:
