@@ -23,7 +23,7 @@ from jaxtyping import Float
 from manifold3d import Error, Manifold, Mesh64, OpType
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -254,18 +254,15 @@ class MeshDistance:
         self.mesh = mesh
         self.size = float(mesh.extents.max())
         vertices, faces, parent = mesh.vertices, mesh.faces, np.arange(len(mesh.faces))
-        self.tree = None
+        self.tree: KDTree | None = None
         if len(faces) > self.WHOLE:
-            vertices, faces, parent = trimesh.remesh.subdivide_to_size(
+            cut = trimesh.remesh.subdivide_to_size(
                 vertices, faces, self.size / self.CUTS, max_iter=32, return_index=True
             )
+            vertices, faces, parent = cut[0], cut[1], cut[-1]
         corners = torch.from_numpy(np.ascontiguousarray(vertices[faces], dtype=np.float64))
-        proper = (
-            torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).norm(
-                dim=-1
-            )
-            > 0
-        )
+        first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+        proper = torch.linalg.cross(first, second).norm(dim=-1) > 0
         corners, parent = corners[proper], parent[proper.numpy()]
         self.corner = corners[:, 0]
         self.edges = corners[:, 1:] - corners[:, :1]
@@ -273,7 +270,7 @@ class MeshDistance:
         if len(mesh.faces) > self.WHOLE:
             centres = corners.mean(1)
             self.reach = float((corners - centres[:, None]).norm(dim=-1).max())
-            self.tree = cKDTree(centres.numpy())
+            self.tree = KDTree(centres.numpy())
 
     def __call__(
         self, point: Float[Tensor, "n 3"]
@@ -463,7 +460,8 @@ def _rows(distance: MeshDistance, point: Tensor) -> Tensor:
 
 def _surface_points(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Points spread evenly over the area, and the normals of their triangles."""
-    point, face = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    drawn = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    point, face = drawn[0], drawn[1]
     return torch.from_numpy(np.array(point)), torch.from_numpy(np.array(mesh.face_normals)[face])
 
 

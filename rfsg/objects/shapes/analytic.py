@@ -300,6 +300,8 @@ class HalfSpace(Analytic):
     """Everything below the plane z = 0: ground, or a very thick wall. Unbounded."""
 
     kind = "halfspace"
+    _bounds: Tensor
+    _planes: Tensor
 
     def __init__(self) -> None:
         super().__init__()

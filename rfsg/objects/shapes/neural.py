@@ -39,6 +39,10 @@ class NeuralShape(nn.Module):
     kind = "neural"
     convex = False
     exact = False
+    _bounds: Tensor
+    _centre: Tensor
+    _reach: Tensor
+    _octaves: Tensor
 
     def __init__(
         self,
@@ -74,7 +78,7 @@ class NeuralShape(nn.Module):
         self.register_buffer("_octaves", octaves, persistent=False)
         encoded = 3 + 6 * frequencies
         inputs = [encoded] + [width + encoded * (i == skip) for i in range(1, depth)]
-        self.hidden = nn.ModuleList(nn.Linear(n, width) for n in inputs)
+        self.hidden = nn.ModuleList([nn.Linear(n, width) for n in inputs])
         self.to_value = nn.Linear(width, 1)
         self.to_feature = nn.Linear(width, features)
         self._start_as_sphere(seed)
@@ -83,7 +87,8 @@ class NeuralShape(nn.Module):
     def config(self) -> dict[str, object]:
         """Constructor arguments, ready for JSON."""
         names = "width depth skip frequencies features softness lipschitz".split()
-        return {"bounds": self._bounds.tolist()} | {name: getattr(self, name) for name in names}
+        sizes: dict[str, object] = {name: getattr(self, name) for name in names}
+        return {"bounds": self._bounds.tolist()} | sizes
 
     def bounds(self) -> Float[Tensor, "2 3"]:
         return self._bounds
@@ -149,6 +154,7 @@ class NeuralShape(nn.Module):
         spread = math.sqrt(2 / self.width)
         sines = 6 * self.frequencies
         for i, layer in enumerate(self.hidden):
+            assert isinstance(layer, nn.Linear)
             nn.init.normal_(layer.weight, 0.0, spread, generator=generator)
             nn.init.zeros_(layer.bias)
             if i in (0, self.skip):
@@ -169,8 +175,8 @@ class NeuralShape(nn.Module):
         outward = F.normalize(torch.randn(512, 3, generator=generator).to(self._bounds), dim=-1)
         value, gradient = self.value_and_gradient(self._centre + 0.5 * self._reach * outward)
         slope = (gradient * outward).sum(-1).mean()
-        self.to_value.weight /= slope
-        self.to_value.bias -= value.mean() / self._reach / slope
+        self.to_value.weight.div_(slope)
+        self.to_value.bias.sub_(value.mean() / self._reach / slope)
 
     def _swept(
         self, sweep: Callable[[Tensor, "_Weights"], tuple[Tensor, ...]], point: Tensor
@@ -192,7 +198,7 @@ class NeuralShape(nn.Module):
     def _feature(self, point: Tensor, w: "_Weights") -> tuple[Tensor]:
         return (F.linear(self._forward(self._encode(point, w)[0], w), *w.feature),)
 
-    def _value_and_gradient(self, point: Tensor, w: "_Weights") -> tuple[Tensor, Tensor]:
+    def _value_and_gradient(self, point: Tensor, w: "_Weights") -> tuple[Tensor, ...]:
         return self._value_gradient_feature(point, w, with_feature=False)
 
     def _value_gradient_feature(
@@ -267,7 +273,8 @@ class _Weights:
     """A network's weights in the precision of the points, cast once per call."""
 
     def __init__(self, shape: NeuralShape, like: Tensor):
-        def cast(layer: nn.Linear) -> tuple[Tensor, Tensor]:
+        def cast(layer: nn.Module) -> tuple[Tensor, Tensor]:
+            assert isinstance(layer, nn.Linear)
             return layer.weight.to(like.dtype), layer.bias.to(like.dtype)
 
         self.hidden = [cast(layer) for layer in shape.hidden]
