@@ -39,11 +39,11 @@ from rfsg.scene.weights import refuse_overwrite
 MAX_BYTES = 512 * 2**20
 MAX_TRIANGLES = 5_000_000
 MARGIN, LEAST_MARGIN = 0.05, 0.03  # bounds beyond the mesh: share of its size, or metres if more
-STEPS = 3_000
+STEPS = 6_000
 NEAR_BATCH, FAR_BATCH = 512, 256  # smaller batches and more steps learned better per second
 NEAR_POOL, FAR_POOL = 100_000, 50_000
 CHECKPOINT_EVERY = 200
-SHOWN_TOLERANCE = 0.001  # [m] by which the mesh that is only shown may differ from the zero mesh
+SHOWN_TOLERANCE = 0.002  # [m] by which the mesh that is only shown may differ from the zero mesh
 
 Progress = Callable[[int, int, str], None]  # (steps done, steps in all, a word on how it goes)
 
