@@ -65,9 +65,9 @@ def test_hessian_agrees_with_autograd_of_the_value():
 
 
 def test_everything_can_be_differentiated_in_points_and_weights():
-    s = shape(width=6, depth=3, skip=1, frequencies=2, features=3).double()
+    s = shape(width=4, depth=3, skip=1, frequencies=2, features=2).double()
     names = [n for n, _ in s.named_parameters()]
-    x = points(3).requires_grad_()
+    x = points(2).requires_grad_()
     weights = [p.detach().clone().requires_grad_() for p in s.parameters()]
 
     class Ask(torch.nn.Module):
