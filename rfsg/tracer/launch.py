@@ -19,6 +19,7 @@ from rfsg.tracer.embree import Proxies
 from rfsg.tracer.march import MarchOptions, crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains, Crossings, Rays
+from rfsg.tracer.sequences import TooMany, enumerate_chains
 
 TUBE = 2.0  # tubes this much wider than the lattice's spacing: a ray near an edge speaks for its neighbours
 WIDEST = 1.0  # [rad] a tube bent at a sharp edge diverges no further than this
@@ -32,6 +33,7 @@ class SearchReport:
     sequences: int = 0
     candidates: int = 0
     pruned: int = 0  # hits below the power floor
+    complete: bool = False  # every sequence of faces was looked at: nothing can be missing
     per_depth: list[int] = field(default_factory=list)
 
 
@@ -74,11 +76,25 @@ def search(
     frequency: Float[Tensor, "f"],
     quality: Quality,
 ) -> tuple[Chains, SearchReport]:
-    """Candidate chains between every transmitter and every receiver, direct ones included."""
+    """Candidate chains between every transmitter and every receiver, direct ones included.
+
+    Enumerated (``sequences``) where that is complete and affordable, else searched by rays. Raises
+    ValueError when an enumeration that was insisted on is too large.
+    """
     report = SearchReport()
     depth = quality.depth if len(world) else 0
     parts = [_direct(len(tx_position), len(rx_position), depth, world.device)]
-    for t in range(len(tx_position) if depth else 0):
+    if depth and quality.search != "rays" and (quality.curved < 2 or quality.search == "enumerate"):
+        try:
+            parts.append(enumerate_chains(world, tx_position, rx_position, quality))
+            report.complete = True
+        except TooMany:
+            if quality.search == "enumerate":
+                raise ValueError(
+                    "search='enumerate': the scene has too many sequences of faces at "
+                    f"depth {depth}; lower the depth or search by rays"
+                ) from None
+    for t in range(len(tx_position) if depth and not report.complete else 0):
         found: list[Chains] = []
         tubes = first_tubes(tx_position[t], quality)
         report.rays += len(tubes)
@@ -94,8 +110,20 @@ def search(
     chains = Chains(
         *(torch.cat([getattr(p, n) for p in parts]) for n in Chains.__dataclass_fields__)
     )
+    chains = _few_curved(world, chains, quality.curved)
     report.candidates = len(chains.tx)
     return chains, report
+
+
+def _few_curved(world: World, chains: Chains, most: int) -> Chains:
+    """Chains with at most so many reflections on curved or learned faces."""
+    if not len(world) or not chains.which.numel():
+        return chains
+    which, patch = chains.which.clamp(min=0).reshape(-1), chains.patch.clamp(min=0).reshape(-1)
+    planar = world.plane(which, patch)[2].reshape(chains.which.shape)
+    curved = (~planar & (chains.which >= 0)).sum(1)
+    i = torch.nonzero(curved <= most).squeeze(-1)
+    return Chains(*(getattr(chains, n)[i] for n in Chains.__dataclass_fields__))
 
 
 def first_tubes(position: Float[Tensor, "3"], quality: Quality) -> Tubes:

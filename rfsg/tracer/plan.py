@@ -10,6 +10,9 @@ class Quality:
     """How hard to look. Every field may be overridden: ``Quality.named("draft", depth=2)``.
 
     depth: most reflections on a path.
+    curved: most of them on curved or learned faces (each scatters a wave widely; two are weak).
+    search: "auto" enumerates all sequences of faces where the scene is small enough (nothing can be
+        missed) and launches rays elsewhere; "enumerate" or "rays" insist.
     rays: directions launched from each transmitter (Fibonacci lattice).
     floor_db: paths weaker than this below free space at the same length are not followed [dB].
     epsilon: search tolerance of a march on learned shapes [m] (the paper's 0.01 m); hits are polished.
@@ -23,6 +26,8 @@ class Quality:
     """
 
     depth: int = 3
+    curved: int = 1
+    search: str = "auto"
     rays: int = 20_000
     floor_db: float = -120.0
     epsilon: float = 0.01
@@ -55,6 +60,7 @@ PRESETS = {
     "standard": Quality(),
     "reference": Quality(
         depth=5,
+        curved=2,
         rays=200_000,
         floor_db=-200.0,
         crossing_samples=128,

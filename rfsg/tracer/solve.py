@@ -260,7 +260,7 @@ def _stationary(world: World, batch: Batch, wavelength: float, quality: Quality)
         good = status == int(Status.OK)
         status = torch.where(good & ~regular, int(Status.DEGENERATE), status)
         status = torch.where(good & regular & capped, int(Status.CAUSTIC_CAPPED), status)
-        status = _duplicates(batch, vertices, charts.radius, learned, status)
+        status = _duplicates(batch, vertices, charts.radius, status)
     return Solved(vertices, normal, spread, status)
 
 
@@ -300,7 +300,7 @@ def _search(
     exact = torch.nonzero(~learned.any(1)).squeeze(-1)
     if len(exact):
         part = batch.take(exact)
-        x[exact], settled = _newton(part, _surfaces(world, part, None), 2 * quality.newton)
+        x[exact], settled = _newton(part, _surfaces(world, part, None), 3 * quality.newton)
         status[exact] = torch.where(settled, int(Status.OK), int(Status.NOT_CONVERGED))
     rest = torch.nonzero(learned.any(1)).squeeze(-1)
     curvature = torch.zeros_like(charts.radius)
@@ -411,7 +411,9 @@ def _newton(batch: Batch, surfaces: Surfaces, rounds: int) -> tuple[Tensor, Tens
         system = kkt(vertices, jet, multipliers(u, jet.gradient))
         step, regular = solve_regular(system.matrix, system.residual[..., None])
         dx = -step[:, : 3 * depth, 0].reshape(c, depth, 3)
-        reach = 0.5 * torch.minimum(length[:, :-1], length[:, 1:])
+        # no further than half a segment, nor than half a radius of curvature: Newton's model ends there
+        bend = jet.hessian.flatten(2).norm(dim=-1).clamp(min=1e-300)
+        reach = 0.5 * torch.minimum(torch.minimum(length[:, :-1], length[:, 1:]), 1.0 / bend)
         size = dx.norm(dim=-1)
         shrink = torch.where(size > reach, reach / size.clamp(min=1e-300), 1.0).amin(1)
         x = x + shrink[:, None, None] * dx
@@ -442,7 +444,11 @@ def _validate(
         f = world.sdf(which, x).abs().reshape(c, depth)
         on = f <= _tolerance(world, batch, wavelength)
         exact = world.exact[which]
-        same = world.patch(which, x) == batch.patch.reshape(-1)
+        # a planar face is itself alone; a curved surface may be sought from another of its pieces
+        patch = world.patch(which, x)
+        planar = world.plane(which, batch.patch.reshape(-1))[2]
+        curved = ~planar & ~world.plane(which, patch)[2]
+        same = (patch == batch.patch.reshape(-1)) | curved
         on = on & (same | ~exact).reshape(c, depth)
         status = torch.full((c,), int(Status.OK), device=x.device)
         if facets is not None:
@@ -455,14 +461,11 @@ def _validate(
         return status
 
 
-def _duplicates(
-    batch: Batch, vertices: Tensor, radius: Tensor, learned: Tensor, status: Tensor
-) -> Tensor:
-    """Solutions of one sequence of objects closer than a zone are one path: the shortest stays."""
-    c, depth = batch.which.shape
+def _duplicates(batch: Batch, vertices: Tensor, radius: Tensor, status: Tensor) -> Tensor:
+    """Solutions of one sequence of objects closer than a zone (or, on exact surfaces, closer than
+    rounding) are one path: the shortest stays."""
     good = (status == int(Status.OK)) | (status == int(Status.CAUSTIC_CAPPED))
-    has_learned = learned.reshape(c, depth).any(1)
-    i = torch.nonzero(good & has_learned).squeeze(-1)
+    i = torch.nonzero(good).squeeze(-1)
     if len(i) < 2:
         return status
     ends = torch.cat([batch.tx[i], batch.rx[i]], 1)

@@ -1,0 +1,178 @@
+"""The faces of a world: planar ones as rectangles, curved and learned ones as points with normals.
+
+Both come from the objects' own contract: planes and bounds for the first, rays shot at the object
+from all around for the second.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from rfsg.objects.contract import Shape
+from rfsg.scene.world import World, unit
+from rfsg.tracer.march import SEARCH, march
+
+SHOTS = 4096  # rays shot at an object from around it; a 1 m object is sampled every 3 cm
+
+
+@dataclass(frozen=True)
+class Planes:
+    """Planar faces: n.x = offset, a frame (two edges, normal) and half-extents; inf if unbounded."""
+
+    node: Int[Tensor, "k"]
+    patch: Int[Tensor, "k"]
+    normal: Float[Tensor, "k 3"]
+    offset: Float[Tensor, "k"]
+    centre: Float[Tensor, "k 3"]
+    edges: Float[Tensor, "k 2 3"]  # unit vectors in the face
+    half: Float[Tensor, "k 2"]  # [m]
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def corners(self) -> Float[Tensor, "k 4 3"]:
+        sign = torch.tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=torch.float64)
+        reach = sign.to(self.half)[None] * self.half[:, None].clamp(max=UNBOUNDED)
+        return self.centre[:, None] + torch.einsum("kci,kij->kcj", reach, self.edges)
+
+
+UNBOUNDED = 1e6  # [m] stands for the half-extent of a face without an end
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points on the curved and learned faces of one node, with normals and patch numbers."""
+
+    node: int
+    point: Float[Tensor, "s 3"]
+    normal: Float[Tensor, "s 3"]
+    patch: Int[Tensor, "s"]
+    centre: Float[Tensor, "3"]
+    radius: float
+
+
+@torch.no_grad()
+def planes_of(world: World) -> Planes:
+    """Every planar face in the world; a face reaches as far as its object's bounds."""
+    rows = []
+    for node, item in enumerate(world.scene.nodes):
+        table = item.body.shape.planes().to(device=world.device, dtype=torch.float64)
+        for patch in range(table.shape[0]):
+            rows.append(_plane(world, node, patch, table[patch]))
+    if not rows:
+        zero = torch.zeros(0, dtype=torch.float64, device=world.device)
+        none = torch.zeros(0, dtype=torch.int64, device=world.device)
+        flat = zero.reshape(0, 3)
+        return Planes(none, none, flat, zero, flat, zero.reshape(0, 2, 3), zero.reshape(0, 2))
+    node, patch = torch.tensor([r[:2] for r in rows], device=world.device).unbind(1)
+    normal, offset, centre, edges, half = (
+        torch.stack(c) for c in zip(*(r[2:] for r in rows), strict=True)
+    )
+    return Planes(node, patch, normal, offset, centre, edges, half)
+
+
+def _plane(world: World, node: int, patch: int, row: Tensor) -> tuple:
+    """One face in the world, from its row (n, d) and its object's box."""
+    which = torch.tensor([node], device=world.device)
+    normal, low, high = row[:3], *world.bounds_object[node]
+    axis = int(normal.abs().argmax())
+    others = [a for a in range(3) if a != axis]
+    eye = torch.eye(3, dtype=torch.float64, device=world.device)
+    middle = torch.where(torch.isfinite(low + high), 0.5 * (low + high), torch.zeros_like(low))
+    centre = middle + (row[3] - middle @ normal) * normal
+    half = (0.5 * (high - low))[others] * world.scale[node]
+    return (
+        node,
+        patch,
+        world.direction_world(which, normal[None])[0],
+        row[3] * world.scale[node]
+        + world.direction_world(which, normal[None])[0] @ world.translation[node],
+        world.point_world(which, centre[None])[0],
+        world.direction_world(which.repeat(2), eye[others]),
+        torch.where(torch.isfinite(half), half, torch.full_like(half, torch.inf)),
+    )
+
+
+@torch.no_grad()
+def samples_of(world: World) -> list[Samples]:
+    """Sampled faces of every node that has curved or learned ones."""
+    out = []
+    for node, item in enumerate(world.scene.nodes):
+        point, normal, patch = _sampled(item.body.shape, world.device)
+        if not len(point):
+            continue
+        which = torch.full((len(point),), node, device=world.device)
+        low, high = world.bounds_object[node]
+        out.append(
+            Samples(
+                node,
+                world.point_world(which, point),
+                world.direction_world(which, normal),
+                patch,
+                world.point_world(which[:1], 0.5 * (low + high)[None])[0],
+                float((high - low).norm() * 0.5 * world.scale[node]),
+            )
+        )
+    return out
+
+
+_CACHE: dict[int, tuple[object, tuple[Tensor, Tensor, Tensor]]] = {}
+MOST_CACHED = 64
+
+
+def _sampled(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Samples in the object's frame, kept while the shape's parameters stay as they are."""
+    parameters = list(getattr(shape, "parameters", list)())
+    state = (shape, tuple((p.data_ptr(), p._version) for p in parameters))
+    kept = _CACHE.get(id(shape))
+    if kept is None or kept[0] != state:
+        if len(_CACHE) >= MOST_CACHED:
+            _CACHE.clear()
+        kept = (state, _shoot(shape, device))
+        _CACHE[id(shape)] = kept
+    return kept[1]
+
+
+def _shoot(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+    """Where rays from all around first meet the object, less its planar faces."""
+    blank = torch.zeros(0, 3, dtype=torch.float64, device=device)
+    nothing = (blank, blank, torch.zeros(0, dtype=torch.int64, device=device))
+    bounds = shape.bounds().to(device=device, dtype=torch.float64)
+    flat = shape.planes().shape[0]
+    if not bool(torch.isfinite(bounds).all()) or (shape.exact and flat == 6):
+        return nothing
+    origin, direction, length = _aim(bounds)
+    if shape.convex:
+        enter, leave = shape.interval(origin, direction)
+        hit = leave > enter
+    else:
+        row, t, _ = march(shape, origin, direction, length, SEARCH)
+        enter = torch.full_like(length, torch.inf)
+        enter = enter.scatter_reduce(0, row, t, "amin")
+        hit = torch.isfinite(enter)
+    point = origin[hit] + enter[hit, None] * direction[hit]
+    normal_at = getattr(shape, "normal_at", None)
+    normal = normal_at(point) if normal_at else unit(shape.value_and_gradient(point)[1])
+    patch = shape.patch(point)
+    curved = torch.ones_like(patch, dtype=torch.bool) if not shape.exact else patch >= flat
+    return point[curved], normal[curved], patch[curved]
+
+
+def _aim(bounds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Rays from a sphere about the bounds to points spread through them (a Halton-like lattice)."""
+    low, high = bounds
+    centre, reach = 0.5 * (low + high), 1.05 * float((high - low).norm()) * 0.5
+    k = torch.arange(SHOTS, dtype=torch.float64, device=bounds.device)
+    # the plastic number's powers fill the cube evenly (Roberts 2018), the golden angle the sphere
+    steps = torch.tensor([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])
+    inside = low + torch.frac(0.5 + k[:, None] * steps.to(k)) * (high - low)
+    z = 1.0 - 2.0 * (k + 0.5) / SHOTS
+    angle = torch.pi * (3.0 - 5.0**0.5) * k
+    r = torch.sqrt(1.0 - z * z)
+    origin = centre + reach * torch.stack([r * torch.cos(angle), r * torch.sin(angle), z], -1)
+    direction = unit(inside - origin)
+    return origin, direction, torch.full_like(k, 2.0 * reach)
+
+

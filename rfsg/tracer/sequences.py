@@ -1,0 +1,356 @@
+"""The complete search: every sequence of planar faces, and one curved or learned face among them.
+
+Rays may miss a beam thinner than their spacing, and miss it from one end only; then a path is lost
+without a word and reciprocity with it. Where a scene is small enough, sequences are enumerated
+instead. A planar mirror turns the transmitter into an image, so whatever a prefix of planar faces
+sends out seems to come from one point through one rectangle: the next face must have that point in
+front of it and lie, at least in part, in that beam. With one curved face in the sequence, the planar
+prefix and suffix give an image at either end, and the glints between the two images are looked up on
+samples of the face: the same from both ends, whatever the spacing of any rays.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rfsg.scene.world import World, unit
+from rfsg.tracer.faces import Planes, Samples, planes_of, samples_of
+from rfsg.tracer.plan import Quality
+from rfsg.tracer.records import Chains
+
+MOST_PAIRS = 30_000_000  # beam tests and image solves that an enumeration may take (a minute of work)
+STEEP = 0.6  # slope of the path's length at the sample nearest to a glint: samples are closer than this
+EDGE = 1e-9  # of a face's extent: a path through a face's very edge belongs to it
+
+
+class TooMany(Exception):
+    """The scene has more sequences than an enumeration should take; search by rays instead."""
+
+
+@dataclass(frozen=True)
+class Prefixes:
+    """Sequences of planar faces seen from one source: the image it makes and the faces, in order."""
+
+    image: Float[Tensor, "p 3"]
+    faces: Int[Tensor, "p d"]
+
+    def take(self, i: Tensor) -> "Prefixes":
+        return Prefixes(self.image[i], self.faces[i])
+
+
+@torch.no_grad()
+def enumerate_chains(
+    world: World,
+    tx_position: Float[Tensor, "t 3"],
+    rx_position: Float[Tensor, "r 3"],
+    quality: Quality,
+) -> Chains:
+    """All candidate chains with at most one curved or learned face, direct ones left out.
+
+    Raises TooMany when the scene is too large for it.
+    """
+    planes, samples = planes_of(world), samples_of(world)
+    if not quality.curved:
+        samples = []
+    budget = Budget(MOST_PAIRS)
+    parts = []
+    inner = quality.depth - 1 if samples else 0
+    behind = [_levels(planes, rx_position[r], inner, budget) for r in range(len(rx_position))]
+    for t in range(len(tx_position)):
+        ahead = _levels(planes, tx_position[t], quality.depth, budget)
+        for level in ahead[1:]:
+            parts.append(_planar_chains(planes, level, t, rx_position, quality, budget))
+        for item in samples:
+            fore = [_reaching(planes, p, item) for p in ahead[:-1]]
+            for r in range(len(rx_position)):
+                aft = [_reaching(planes, p, item) for p in behind[r]]
+                parts.append(_glint_chains(planes, item, fore, aft, t, r, quality, budget))
+    return _join(parts, quality.depth, world.device)
+
+
+class Budget:
+    """Counts work and raises TooMany when it runs out."""
+
+    def __init__(self, most: int):
+        self.left = most
+
+    def spend(self, amount: int) -> None:
+        self.left -= amount
+        if self.left < 0:
+            raise TooMany
+
+
+def _levels(planes: Planes, source: Tensor, depth: int, budget: Budget) -> list[Prefixes]:
+    """Prefixes of 0, 1, ... depth faces from a source."""
+    none = torch.zeros(1, 0, dtype=torch.int64, device=source.device)
+    levels = [Prefixes(source[None], none)]
+    for _ in range(depth):
+        levels.append(_extend(planes, levels[-1], budget))
+    return levels
+
+
+def _extend(planes: Planes, prefixes: Prefixes, budget: Budget) -> Prefixes:
+    p, k = len(prefixes.image), len(planes)
+    budget.spend(p * k)
+    image = [prefixes.image[:0]]
+    face = [torch.zeros(0, prefixes.faces.shape[1] + 1, dtype=torch.int64, device=planes.node.device)]
+    block = max(1, 2_000_000 // max(k, 1))
+    for begin in range(0, p, block):
+        some = prefixes.take(torch.arange(begin, min(p, begin + block), device=planes.node.device))
+        front = some.image @ planes.normal.T - planes.offset > 0
+        if prefixes.faces.shape[1]:
+            front &= _visible(planes, some)
+        row, column = torch.nonzero(front, as_tuple=True)
+        if prefixes.faces.shape[1]:
+            kept = _in_beam(planes, some, row, column)
+            row, column = row[kept], column[kept]
+        image.append(_mirror(planes, some.image[row], column))
+        face.append(torch.cat([some.faces[row], column[:, None]], 1))
+    return Prefixes(torch.cat(image), torch.cat(face))
+
+
+def _mirror(planes: Planes, point: Tensor, face: Tensor) -> Tensor:
+    height = (point * planes.normal[face]).sum(-1) - planes.offset[face]
+    return point - 2.0 * height[:, None] * planes.normal[face]
+
+
+def _visible(planes: Planes, prefixes: Prefixes) -> Bool[Tensor, "p k"]:
+    """Faces with some corner on the outgoing side of the prefix's last face, and not that face."""
+    last = prefixes.faces[:, -1]
+    corners = planes.corners().reshape(-1, 3)
+    height = (corners @ planes.normal.T).reshape(len(planes), 4, -1) - planes.offset
+    beyond = height.amax(1).T > 0  # [last, face]
+    beyond = beyond & ~torch.eye(len(planes), dtype=torch.bool, device=beyond.device)
+    return beyond[last]
+
+
+def _in_beam(planes: Planes, prefixes: Prefixes, row: Tensor, face: Tensor) -> Bool[Tensor, "m"]:
+    """Does the shadow of a face, cast from the image onto the last face, meet that face's rectangle?
+
+    Corners behind the last face are pulled to just in front of it: the shadow then only grows.
+    """
+    last = prefixes.faces[row, -1]
+    image, corner = prefixes.image[row], planes.corners()[face]
+    normal, offset = planes.normal[last], planes.offset[last]
+    near = (image * normal).sum(-1) - offset  # negative: images lie behind their mirror
+    height = (corner * normal[:, None]).sum(-1) - offset[:, None]
+    behind = height <= 0
+    t = -near[:, None] / (height - near[:, None]).clamp(min=1e-12)
+    shadow = image[:, None] + t[..., None] * (corner - image[:, None])
+    local = shadow - planes.centre[last][:, None]
+    uv = torch.einsum("mcj,mij->mci", local, planes.edges[last])
+    half = planes.half[last] * (1 + EDGE)
+    apart = (uv.amin(1) > half) | (uv.amax(1) < -half)
+    return behind.any(1) | ~apart.any(1)
+
+
+def _planar_chains(
+    planes: Planes, prefixes: Prefixes, t: int, rx_position: Tensor, quality: Quality, budget: Budget
+) -> Chains:
+    """Prefixes whose last face mirrors the image onto a receiver through its rectangle."""
+    p, r = len(prefixes.image), len(rx_position)
+    budget.spend(p * r)
+    none = torch.zeros(0, dtype=torch.int64, device=rx_position.device)
+    rows, columns = [none], [none]
+    block = max(1, 1_000_000 // max(r, 1))
+    for begin in range(0, p, block):
+        some = prefixes.take(torch.arange(begin, min(p, begin + block), device=rx_position.device))
+        row, column = torch.nonzero(_through_last(planes, some, rx_position), as_tuple=True)
+        rows.append(row + begin)
+        columns.append(column)
+    row, rx = torch.cat(rows), torch.cat(columns)
+    face = prefixes.faces[row]
+    seed = torch.zeros(*face.shape, 3, dtype=torch.float64, device=face.device)
+    return _chains(planes, t, rx, face, seed, quality.depth)
+
+
+def _through_last(planes: Planes, prefixes: Prefixes, point: Tensor) -> Bool[Tensor, "p n"]:
+    """Does the line from an image to a point pass the last face, from behind to the front?"""
+    last = prefixes.faces[:, -1]
+    normal, offset = planes.normal[last], planes.offset[last]
+    near = (prefixes.image * normal).sum(-1) - offset
+    far = point @ normal.T - offset
+    t = near[:, None] / (near[:, None] - far.T).clamp(max=-1e-300)
+    hit = prefixes.image[:, None] + t[..., None] * (point[None] - prefixes.image[:, None])
+    uv = torch.einsum("pnj,pij->pni", hit - planes.centre[last][:, None], planes.edges[last])
+    half = planes.half[last][:, None] * (1 + EDGE) + 1e-9
+    return (far.T > 0) & (near < 0)[:, None] & (uv.abs() <= half).all(-1)
+
+
+def _reaching(planes: Planes, prefixes: Prefixes, item: Samples) -> Prefixes:
+    """Prefixes whose beam may touch the ball about an object."""
+    if not prefixes.faces.shape[1]:
+        return prefixes
+    last = prefixes.faces[:, -1]
+    normal, offset = planes.normal[last], planes.offset[last]
+    near = (prefixes.image * normal).sum(-1) - offset
+    height = item.centre @ normal.T - offset
+    along = (height - near).clamp(min=1e-12)
+    hit = prefixes.image + (-near / along)[:, None] * (item.centre - prefixes.image)
+    uv = torch.einsum("pj,pij->pi", hit - planes.centre[last], planes.edges[last])
+    # the ball's shadow on the face, cast from the image by the ball's nearest point
+    close = (along - item.radius).clamp(min=1e-12)
+    slant = (item.centre - prefixes.image).norm(dim=-1) / along
+    shadow = item.radius * (-near) / close * slant
+    meets = (uv.abs() <= planes.half[last] + shadow[:, None]).all(-1) | (along <= item.radius)
+    keep = (height > -item.radius) & meets & (planes.node[last] != item.node)
+    return prefixes.take(torch.nonzero(keep).squeeze(-1))
+
+
+def _glint_chains(
+    planes: Planes,
+    item: Samples,
+    fore: list[Prefixes],
+    aft: list[Prefixes],
+    t: int,
+    r: int,
+    quality: Quality,
+    budget: Budget,
+) -> Chains | None:
+    """(planar..., this object, planar...) between one transmitter and one receiver."""
+    parts = []
+    for i, before in enumerate(fore):
+        for j, after in enumerate(aft):
+            if i + j + 1 > quality.depth or not len(before.image) or not len(after.image):
+                continue
+            pair, sample = _glints(item, before.image, after.image, quality, budget)
+            if not len(pair):
+                continue
+            n = len(after.image)
+            parts.append(
+                _glint_part(planes, item, before.take(pair // n), after.take(pair % n), sample, t, r, quality)
+            )
+    return _join(parts, quality.depth, item.point.device) if parts else None
+
+
+def _glints(
+    item: Samples, fore: Tensor, aft: Tensor, quality: Quality, budget: Budget
+) -> tuple[Tensor, Tensor]:
+    """(pair of images, sample) where the path's length slopes least along the face, in each patch."""
+    pairs, s = len(fore) * len(aft), len(item.point)
+    budget.spend(pairs * s // 8)  # a glance at a sample is cheaper than a beam test
+    none = torch.zeros(0, dtype=torch.int64, device=fore.device)
+    found = [(none, none)]
+    block = max(1, 2_000_000 // s)
+    towards_aft = unit(aft[:, None] - item.point[None])
+    towards_fore = unit(fore[:, None] - item.point[None])
+    for begin in range(0, pairs, block):
+        pair = torch.arange(begin, min(pairs, begin + block), device=fore.device)
+        a, b = towards_fore[pair // len(aft)], towards_aft[pair % len(aft)]
+        lit = ((a * item.normal).sum(-1) > 0) & ((b * item.normal).sum(-1) > 0)
+        # the slope of the path's length along the face: zero where it reflects, small when it grazes
+        both = a + b
+        height = (both * item.normal).sum(-1)
+        slope = torch.sqrt(torch.clamp((both * both).sum(-1) - height**2, min=0.0))
+        score = torch.where(lit, -slope, torch.full_like(slope, -4.0))
+        found.append(_best_of_patch(item, pair, score))
+    pair, sample = (torch.cat(c) for c in zip(*found, strict=True))
+    return pair, sample
+
+
+def _best_of_patch(item: Samples, pair: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
+    """In each patch the best sample, if it is good, and better than all samples near it elsewhere."""
+    patches, column = torch.unique(item.patch, return_inverse=True)
+    best = torch.full((len(pair), len(patches)), -4.0, dtype=score.dtype, device=score.device)
+    best = best.scatter_reduce(1, column.expand(len(pair), -1), score, "amax")
+    row, sample = torch.nonzero(
+        (score > -STEEP) & (score == best[:, column]), as_tuple=True
+    )
+    keep = ~_outdone(item, row, sample, score)
+    return pair[row[keep]], sample[keep]
+
+
+def _outdone(item: Samples, row: Tensor, sample: Tensor, score: Tensor) -> Bool[Tensor, "m"]:
+    """A candidate with a better one of the same pair beside it (a flat face spans several patches)."""
+    near = 0.12 * item.radius
+    out = torch.zeros(len(row), dtype=torch.bool, device=row.device)
+    order = torch.argsort(row, stable=True)
+    r, s = row[order], sample[order]
+    value = score[r, s]
+    most = int(torch.bincount(r).max()) if len(r) else 0
+    lost = torch.zeros_like(out)
+    for shift in range(1, most):
+        same = r[shift:] == r[:-shift]
+        close = (item.point[s[shift:]] - item.point[s[:-shift]]).norm(dim=-1) < near
+        alike = (item.normal[s[shift:]] * item.normal[s[:-shift]]).sum(-1) > 0.9
+        rival = same & close & alike
+        lost[shift:] |= rival & (value[shift:] <= value[:-shift])
+        lost[:-shift] |= rival & (value[:-shift] < value[shift:])
+    out[order] = lost
+    return out
+
+
+def _glint_part(
+    planes: Planes,
+    item: Samples,
+    before: Prefixes,
+    after: Prefixes,
+    sample: Tensor,
+    t: int,
+    r: int,
+    quality: Quality,
+) -> Chains:
+    """Chains of one length, seeded by the image method on either side of the sample."""
+    x = item.point[sample]
+    fore = _unfold(planes, before, x)
+    aft = _unfold(planes, after, x).flip(1)
+    c = len(sample)
+    node = torch.full((c, 1), item.node, dtype=torch.int64, device=x.device)
+    back = after.faces.flip(1)
+    which = torch.cat([planes.node[before.faces], node, planes.node[back]], 1)
+    patch = torch.cat([planes.patch[before.faces], item.patch[sample][:, None], planes.patch[back]], 1)
+    seed = torch.cat([fore, x[:, None], aft], 1)
+    good = torch.isfinite(seed).all(-1).all(-1)
+    ends = torch.full((c,), t, device=x.device), torch.full((c,), r, device=x.device)
+    chains = Chains(ends[0], ends[1], which, patch, seed)
+    return _padded(_take(chains, torch.nonzero(good).squeeze(-1)), quality.depth)
+
+
+def _unfold(planes: Planes, prefixes: Prefixes, target: Tensor) -> Float[Tensor, "c d 3"]:
+    """Where the path from a source through its prefix of mirrors to a target meets the mirrors."""
+    image, points = prefixes.image, []
+    for level in range(prefixes.faces.shape[1] - 1, -1, -1):
+        face = prefixes.faces[:, level]
+        near = (image * planes.normal[face]).sum(-1) - planes.offset[face]
+        far = (target * planes.normal[face]).sum(-1) - planes.offset[face]
+        slope = near - far
+        share = near / torch.where(slope == 0, torch.ones_like(slope), slope)
+        target = image + share[:, None] * (target - image)
+        points.insert(0, target)
+        image = _mirror(planes, image, face)
+    if not points:
+        return image.new_zeros(len(image), 0, 3)
+    return torch.stack(points, 1)
+
+
+def _chains(planes: Planes, t: int, rx: Tensor, face: Tensor, seed: Tensor, depth: int) -> Chains:
+    tx = torch.full_like(rx, t)
+    return _padded(Chains(tx, rx, planes.node[face], planes.patch[face], seed), depth)
+
+
+def _padded(chains: Chains, depth: int) -> Chains:
+    missing = depth - chains.which.shape[1]
+    pad = torch.nn.functional.pad
+    return Chains(
+        chains.tx,
+        chains.rx,
+        pad(chains.which, (0, missing), value=-1),
+        pad(chains.patch, (0, missing), value=-1),
+        pad(chains.seed, (0, 0, 0, missing)),
+    )
+
+
+def _take(chains: Chains, i: Tensor) -> Chains:
+    return Chains(*(getattr(chains, n)[i] for n in Chains.__dataclass_fields__))
+
+
+def _join(parts: list[Chains | None], depth: int, device: torch.device) -> Chains:
+    some = [p for p in parts if p is not None]
+    if not some:
+        none = torch.zeros(0, dtype=torch.int64, device=device)
+        empty = none.reshape(0, depth)
+        seed = torch.zeros(0, depth, 3, dtype=torch.float64, device=device)
+        return Chains(none, none, empty, empty, seed)
+    return Chains(*(torch.cat([getattr(p, n) for p in some]) for n in Chains.__dataclass_fields__))
