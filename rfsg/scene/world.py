@@ -14,7 +14,7 @@ from torch import Tensor
 
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Contact, Crossing, Jet, Shape
-from rfsg.objects.shapes.analytic import Box, Boxes
+from rfsg.objects.shapes.analytic import Box, Boxes, HalfSpace
 from rfsg.scene.scene import Scene
 
 
@@ -41,6 +41,7 @@ class World:
         self.box_of_node = torch.cumsum(is_box.long(), 0) - 1
         self.bounds_object = _stack([n.body.shape.bounds() for n in nodes], (2, 3), self.device)
         self.exact = self._flags(lambda b: b.shape.exact)
+        self.flat = self._flags(lambda b: isinstance(b.shape, (Box, HalfSpace)))
         self.convex = self._flags(lambda b: b.shape.convex)
         self.opaque = self._flags(lambda b: b.surface.opaque)
         self.learned_surface = self._flags(lambda b: b.surface.kind == "stochastic")

@@ -8,13 +8,20 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
+from rfsg.objects.body import Body
 from rfsg.objects.contract import Shape
+from rfsg.objects.surfaces.interface import Conductor
+from rfsg.scene.pose import Pose
+from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World, unit
-from rfsg.tracer.march import SEARCH, march
+from rfsg.tracer.march import MarchOptions, march
+from rfsg.tracer.zone import Facets, measure, take, zone_radius
 
 SHOTS = 4096  # rays shot at an object from around it; a 1 m object is sampled every 3 cm
+COARSE = MarchOptions(step_floor=5e-3)  # samples are only where to begin looking
 
 
 @dataclass(frozen=True)
@@ -43,12 +50,17 @@ UNBOUNDED = 1e6  # [m] stands for the half-extent of a face without an end
 
 @dataclass(frozen=True)
 class Samples:
-    """Points on the curved and learned faces of one node, with normals and patch numbers."""
+    """Points on the curved and learned faces of one node, with normals and patch numbers.
+
+    reach: distance to the sixth nearest sample [m]; curvature: how fast normals turn there [1/m].
+    """
 
     node: int
     point: Float[Tensor, "s 3"]
     normal: Float[Tensor, "s 3"]
     patch: Int[Tensor, "s"]
+    reach: Float[Tensor, "s"]
+    curvature: Float[Tensor, "s"]
     centre: Float[Tensor, "3"]
     radius: float
 
@@ -100,7 +112,7 @@ def samples_of(world: World) -> list[Samples]:
     """Sampled faces of every node that has curved or learned ones."""
     out = []
     for node, item in enumerate(world.scene.nodes):
-        point, normal, patch = _sampled(item.body.shape, world.device)
+        point, normal, patch, reach, curvature = _sampled(item.body.shape, world.device)
         if not len(point):
             continue
         which = torch.full((len(point),), node, device=world.device)
@@ -111,6 +123,8 @@ def samples_of(world: World) -> list[Samples]:
                 world.point_world(which, point),
                 world.direction_world(which, normal),
                 patch,
+                reach * world.scale[node],
+                curvature / world.scale[node],
                 world.point_world(which[:1], 0.5 * (low + high)[None])[0],
                 float((high - low).norm() * 0.5 * world.scale[node]),
             )
@@ -118,21 +132,103 @@ def samples_of(world: World) -> list[Samples]:
     return out
 
 
-_CACHE: dict[int, tuple[object, tuple[Tensor, Tensor, Tensor]]] = {}
+_CACHE: dict[int, tuple[object, tuple[Tensor, ...]]] = {}
 MOST_CACHED = 64
 
 
-def _sampled(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
+def _sampled(shape: Shape, device: torch.device) -> tuple[Tensor, ...]:
     """Samples in the object's frame, kept while the shape's parameters stay as they are."""
-    parameters = list(getattr(shape, "parameters", list)())
-    state = (shape, tuple((p.data_ptr(), p._version) for p in parameters))
+    state = _state(shape)
     kept = _CACHE.get(id(shape))
     if kept is None or kept[0] != state:
         if len(_CACHE) >= MOST_CACHED:
             _CACHE.clear()
-        kept = (state, _shoot(shape, device))
+        point, normal, patch = _shoot(shape, device)
+        kept = (state, (point, normal, patch, *_neighbourhood(point, normal)))
         _CACHE[id(shape)] = kept
     return kept[1]
+
+
+@torch.no_grad()
+def nearest_facets(
+    world: World, which: Int[Tensor, "m"], point: Float[Tensor, "m 3"], wavelength: float
+) -> Facets:
+    """The measured facet of the sample nearest to each point: a first look that asks no network.
+
+    Samples are measured once for a shape and a wavelength, over a zone of a path of a few metres.
+    """
+    local = world.point_object(which, point)
+    found = []
+    for shape, i in world.groups(which):
+        scale = world.scale[which[i]]
+        tree, facets = _measured(shape, world.device, wavelength / float(scale[0]))
+        nearest = torch.from_numpy(tree.query(local[i].cpu().numpy())[1]).to(i.device)
+        found.append((i, take(facets, nearest)))
+    order = torch.argsort(torch.cat([i for i, _ in found]))
+    whole = Facets(
+        *(
+            torch.cat([getattr(f, name) for _, f in found])[order]
+            for name in Facets.__dataclass_fields__
+        )
+    )
+    scale = world.scale[which]
+    rows = [world.direction_world(which, whole.frame[:, k]) for k in range(3)]
+    return Facets(
+        world.point_world(which, whole.centre),
+        torch.stack(rows, 1),
+        whole.offset * scale,
+        whole.slope,
+        whole.bend / scale[:, None, None],
+        whole.residual * scale,
+        whole.weight,
+        whole.radius * scale,
+    )
+
+
+_FACETS: dict[tuple[int, float], tuple[object, tuple[cKDTree, Facets]]] = {}
+LOOK = 1.0  # [m] reduced distance d1 d2 / (d1 + d2) of the path that samples are measured for
+
+
+def _measured(shape: Shape, device: torch.device, wavelength: float) -> tuple[cKDTree, Facets]:
+    """Facets of a shape's samples in its own frame, kept like the samples themselves."""
+    key = (id(shape), round(wavelength, 9))
+    state = _state(shape)
+    kept = _FACETS.get(key)
+    if kept is None or kept[0] != state:
+        if len(_FACETS) >= MOST_CACHED:
+            _FACETS.clear()
+        point, normal, _, _, curvature = _sampled(shape, device)
+        world = World(Scene((Node("/look", Body(shape, Conductor()), Pose.identity()),)), device)
+        which = torch.zeros(len(point), dtype=torch.int64, device=device)
+        half = torch.full_like(curvature, 2.0 * LOOK)
+        radius = zone_radius(half, half, torch.ones_like(half), curvature, wavelength)
+        facets = measure(world, which, point, normal, radius, wavelength, 2, torch.float32)
+        kept = (state, (cKDTree(point.cpu().numpy()), facets))
+        _FACETS[key] = kept
+    return kept[1]
+
+
+def _state(shape: Shape) -> tuple:
+    """Changes when a parameter of the shape does."""
+    parameters = list(getattr(shape, "parameters", list)())
+    return (shape, tuple((p.data_ptr(), p._version) for p in parameters))
+
+
+def _neighbourhood(point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+    """(reach, curvature) of samples from their six nearest neighbours."""
+    if len(point) <= NEIGHBOURS:
+        far = torch.full_like(point[:, 0], torch.inf)
+        return far, torch.zeros_like(far)
+    distance, index = cKDTree(point.cpu().numpy()).query(point.cpu().numpy(), k=NEIGHBOURS + 1)
+    away = torch.from_numpy(distance[:, 1:]).to(point)
+    turn = (normal[torch.from_numpy(index[:, 1:]).to(point.device)] - normal[:, None]).norm(dim=-1)
+    # a neighbour round a sharp edge is on another face and says nothing of how this one bends
+    bend = torch.where(turn < SHARP, turn / away.clamp(min=1e-12), torch.zeros_like(turn))
+    return away[:, -1], bend.amax(1)
+
+
+NEIGHBOURS = 6
+SHARP = 1.0  # normals this far apart (60 degrees) belong to different faces
 
 
 def _shoot(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
@@ -148,7 +244,7 @@ def _shoot(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
         enter, leave = shape.interval(origin, direction)
         hit = leave > enter
     else:
-        row, t, _ = march(shape, origin, direction, length, SEARCH)
+        row, t, _ = march(shape, origin, direction, length, COARSE)
         enter = torch.full_like(length, torch.inf)
         enter = enter.scatter_reduce(0, row, t, "amin")
         hit = torch.isfinite(enter)
@@ -173,6 +269,9 @@ def _aim(bounds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     r = torch.sqrt(1.0 - z * z)
     origin = centre + reach * torch.stack([r * torch.cos(angle), r * torch.sin(angle), z], -1)
     direction = unit(inside - origin)
-    return origin, direction, torch.full_like(k, 2.0 * reach)
-
-
+    # begin at the bounds: a learned shape says nothing about the space outside them
+    safe = torch.where(direction == 0, torch.full_like(direction, 1e-300), direction)
+    ends = torch.stack([(low - origin) / safe, (high - origin) / safe])
+    enter = ends.amin(0).amax(-1).clamp(min=0.0)
+    leave = ends.amax(0).amin(-1)
+    return origin + enter[:, None] * direction, direction, (leave - enter).clamp(min=0.0)

@@ -50,9 +50,7 @@ def passages(
     p, k = paths.vertices.shape[:2]
     length, u = segments(paths.vertices.detach())
     path, segment = torch.nonzero(length > 0, as_tuple=True)
-    rays = Rays(
-        paths.vertices.detach()[path, segment], u[path, segment], length[path, segment]
-    )
+    rays = Rays(paths.vertices.detach()[path, segment], u[path, segment], length[path, segment])
     parts = []
     for i in torch.arange(len(path), device=world.device).split(quality.chunk):
         some = Rays(rays.origin[i], rays.direction[i], rays.limit[i])

@@ -52,7 +52,9 @@ def kkt(vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"]) -
     matrix = vertices.new_zeros(c, n, n)
     for i in range(depth):
         a, row = slice(3 * i, 3 * i + 3), 3 * depth + i
-        matrix[:, a, a] = across[:, i] + across[:, i + 1] + lam[:, i, None, None] * jet.hessian[:, i]
+        matrix[:, a, a] = (
+            across[:, i] + across[:, i + 1] + lam[:, i, None, None] * jet.hessian[:, i]
+        )
         matrix[:, a, row] = jet.gradient[:, i]
         matrix[:, row, a] = jet.gradient[:, i]
         if i + 1 < depth:

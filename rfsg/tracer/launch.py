@@ -110,19 +110,21 @@ def search(
     chains = Chains(
         *(torch.cat([getattr(p, n) for p in parts]) for n in Chains.__dataclass_fields__)
     )
-    chains = _few_curved(world, chains, quality.curved)
+    chains = _few_curved(world, chains, quality)
     report.candidates = len(chains.tx)
     return chains, report
 
 
-def _few_curved(world: World, chains: Chains, most: int) -> Chains:
-    """Chains with at most so many reflections on curved or learned faces."""
+def _few_curved(world: World, chains: Chains, quality: Quality) -> Chains:
+    """Chains with no more reflections on curved or learned faces than the quality follows."""
     if not len(world) or not chains.which.numel():
         return chains
     which, patch = chains.which.clamp(min=0).reshape(-1), chains.patch.clamp(min=0).reshape(-1)
     planar = world.plane(which, patch)[2].reshape(chains.which.shape)
     curved = (~planar & (chains.which >= 0)).sum(1)
-    i = torch.nonzero(curved <= most).squeeze(-1)
+    order = (chains.which >= 0).sum(1)
+    few = (curved == 0) | ((curved <= quality.curved) & (order <= quality.curved_depth))
+    i = torch.nonzero(few).squeeze(-1)
     return Chains(*(getattr(chains, n)[i] for n in Chains.__dataclass_fields__))
 
 
@@ -160,7 +162,9 @@ def _bounce(
 def join(parts: list[Tubes]) -> Tubes:
     if len(parts) == 1:
         return parts[0]
-    rays = Rays(*(torch.cat([getattr(p.rays, n) for p in parts]) for n in Rays.__dataclass_fields__))
+    rays = Rays(
+        *(torch.cat([getattr(p.rays, n) for p in parts]) for n in Rays.__dataclass_fields__)
+    )
     names = ("width", "spread", "bound", "history", "vertices")
     return Tubes(rays, *(torch.cat([getattr(p, n) for p in parts]) for n in names))
 

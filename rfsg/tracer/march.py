@@ -24,7 +24,7 @@ class MarchOptions:
     """step_floor: least step [m], so the thinnest thing sure to be seen. dtype: float32 to search,
     float64 to evaluate. polish: bisection-safe secant steps on a bracket. chunk: spans at a time."""
 
-    step_floor: float = 1e-3
+    step_floor: float = 2e-3
     dtype: torch.dtype = torch.float32
     polish: int = 6
     chunk: int = 65_536
@@ -35,9 +35,7 @@ EVALUATE = MarchOptions(dtype=torch.float64, polish=40)
 
 
 @torch.no_grad()
-def crossings(
-    world: World, rays: Rays, spans: Spans, options: MarchOptions = SEARCH
-) -> Crossings:
+def crossings(world: World, rays: Rays, spans: Spans, options: MarchOptions = SEARCH) -> Crossings:
     """The true stretches of rays inside objects, within their spans, with outward normals."""
     convex = world.convex[spans.which]
     parts = [_convex(world, rays, _select(spans, convex))]
@@ -100,7 +98,9 @@ def _learned(
         enter = spans.enter[k] + t_in * scale[k]
         leave = spans.enter[k] + t_out * scale[k]
         # an end at the end of the segment is an end inside; one at the end of the box is a way out
-        found.append((spans.ray[k], which[k], enter, torch.minimum(leave, rays.limit[spans.ray[k]])))
+        found.append(
+            (spans.ray[k], which[k], enter, torch.minimum(leave, rays.limit[spans.ray[k]]))
+        )
     return tuple(torch.cat(column) for column in zip(*found, strict=True))  # type: ignore[return-value]
 
 

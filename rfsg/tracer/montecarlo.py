@@ -57,9 +57,7 @@ class Flight:
     inside: Crossings
     toll: Float[Tensor, "m"]
 
-    def power_at(
-        self, ray: Int[Tensor, "k"], distance: Float[Tensor, "k"]
-    ) -> Float[Tensor, "k"]:
+    def power_at(self, ray: Int[Tensor, "k"], distance: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
         """Weight of rays at distances along them, everything left behind paid."""
         paid = torch.zeros_like(distance)
         count = torch.bincount(self.inside.ray, minlength=len(self.weight))
@@ -100,7 +98,9 @@ def flights(
         )
         weight = pattern**2 / per_copy
         for level in range(quality.depth + 1):
-            flight, reflected = _fly(world, proxies, rays, weight, frequency, quality, branching, generator)
+            flight, reflected = _fly(
+                world, proxies, rays, weight, frequency, quality, branching, generator
+            )
             yield copy, flight
             if level == quality.depth or reflected is None:
                 break

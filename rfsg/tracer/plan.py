@@ -11,6 +11,7 @@ class Quality:
 
     depth: most reflections on a path.
     curved: most of them on curved or learned faces (each scatters a wave widely; two are weak).
+    curved_depth: most reflections in all on a path that has a curved or learned face.
     search: "auto" enumerates all sequences of faces where the scene is small enough (nothing can be
         missed) and launches rays elsewhere; "enumerate" or "rays" insist.
     rays: directions launched from each transmitter (Fibonacci lattice).
@@ -27,13 +28,14 @@ class Quality:
 
     depth: int = 3
     curved: int = 1
+    curved_depth: int = 2
     search: str = "auto"
     rays: int = 20_000
-    floor_db: float = -120.0
+    floor_db: float = -80.0
     epsilon: float = 0.01
     crossing_samples: int = 32
     integral: str = "telescoped"
-    zone_rings: int = 3
+    zone_rings: int = 2
     refits: int = 20
     newton: int = 12
     map_rays: int = 100_000
@@ -49,7 +51,9 @@ class Quality:
         known = {f.name for f in fields(Quality)}
         wrong = sorted(set(overrides) - known)
         if wrong:
-            raise ValueError(f"quality field {wrong[0]!r}: expected one of {', '.join(sorted(known))}")
+            raise ValueError(
+                f"quality field {wrong[0]!r}: expected one of {', '.join(sorted(known))}"
+            )
         return replace(PRESETS[name], **overrides)  # type: ignore[arg-type]
 
 
@@ -61,6 +65,7 @@ PRESETS = {
     "reference": Quality(
         depth=5,
         curved=2,
+        curved_depth=5,
         rays=200_000,
         floor_db=-200.0,
         crossing_samples=128,
@@ -85,7 +90,9 @@ def make_plan(world: World, quality: Quality) -> Plan:
     radios = (*scene.transmitters, *scene.receivers)
     modelled, left_out = ["line of sight and its blocking"], []
     if len(world) and quality.depth:
-        modelled.append(f"specular reflection up to {quality.depth} times, with penetration between")
+        modelled.append(
+            f"specular reflection up to {quality.depth} times, with penetration between"
+        )
     elif len(world):
         left_out.append("reflection: the depth asked for is 0")
     else:

@@ -24,7 +24,9 @@ from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import positions, resolve_frequency, simulate
 
 SUB = 4  # sub-cells per side, from which the spread within a cell is read
-MOST_CELLS = 4_000_000  # a map larger than this is a mistyped cell size: refuse before taking memory
+MOST_CELLS = (
+    4_000_000  # a map larger than this is a mistyped cell size: refuse before taking memory
+)
 
 
 @dataclass(frozen=True)
@@ -81,7 +83,9 @@ def radio_map(
     nx, ny = (max(1, math.ceil(s / cell - 1e-9)) for s in (x1 - x0, y1 - y0))
     if not (cell > 0 and x1 > x0 and y1 > y0) or nx * ny > MOST_CELLS:
         raise SceneError(
-            [f"map: {nx} x {ny} cells of {cell} m over {(x0, y0, x1, y1)}: expected 1 to {MOST_CELLS}"]
+            [
+                f"map: {nx} x {ny} cells of {cell} m over {(x0, y0, x1, y1)}: expected 1 to {MOST_CELLS}"
+            ]
         )
     x = x0 + cell * (torch.arange(nx, dtype=torch.float64) + 0.5)
     y = y0 + cell * (torch.arange(ny, dtype=torch.float64) + 0.5)
@@ -98,7 +102,9 @@ def _extent(world: World) -> tuple[float, float, float, float]:
     points.append(positions(radios, world.device))
     every = torch.cat(points)
     if not len(every):
-        raise SceneError(["map: the scene is empty, so it has no extent; give bounds=(x0, y0, x1, y1)"])
+        raise SceneError(
+            ["map: the scene is empty, so it has no extent; give bounds=(x0, y0, x1, y1)"]
+        )
     low, high = every.amin(0), every.amax(0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 

@@ -20,8 +20,10 @@ from rfsg.tracer.faces import Planes, Samples, planes_of, samples_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains
 
-MOST_PAIRS = 30_000_000  # beam tests and image solves that an enumeration may take (a minute of work)
-STEEP = 0.6  # slope of the path's length at the sample nearest to a glint: samples are closer than this
+MOST_PAIRS = (
+    30_000_000  # beam tests and image solves that an enumeration may take (a minute of work)
+)
+NEAR = 3.0  # times the samples' spacing: how far a glint may lie from its nearest sample
 EDGE = 1e-9  # of a face's extent: a path through a face's very edge belongs to it
 
 
@@ -56,14 +58,14 @@ def enumerate_chains(
         samples = []
     budget = Budget(MOST_PAIRS)
     parts = []
-    inner = quality.depth - 1 if samples else 0
+    inner = min(quality.depth, quality.curved_depth) - 1 if samples else 0
     behind = [_levels(planes, rx_position[r], inner, budget) for r in range(len(rx_position))]
     for t in range(len(tx_position)):
         ahead = _levels(planes, tx_position[t], quality.depth, budget)
         for level in ahead[1:]:
             parts.append(_planar_chains(planes, level, t, rx_position, quality, budget))
         for item in samples:
-            fore = [_reaching(planes, p, item) for p in ahead[:-1]]
+            fore = [_reaching(planes, p, item) for p in ahead[: inner + 1]]
             for r in range(len(rx_position)):
                 aft = [_reaching(planes, p, item) for p in behind[r]]
                 parts.append(_glint_chains(planes, item, fore, aft, t, r, quality, budget))
@@ -95,7 +97,9 @@ def _extend(planes: Planes, prefixes: Prefixes, budget: Budget) -> Prefixes:
     p, k = len(prefixes.image), len(planes)
     budget.spend(p * k)
     image = [prefixes.image[:0]]
-    face = [torch.zeros(0, prefixes.faces.shape[1] + 1, dtype=torch.int64, device=planes.node.device)]
+    face = [
+        torch.zeros(0, prefixes.faces.shape[1] + 1, dtype=torch.int64, device=planes.node.device)
+    ]
     block = max(1, 2_000_000 // max(k, 1))
     for begin in range(0, p, block):
         some = prefixes.take(torch.arange(begin, min(p, begin + block), device=planes.node.device))
@@ -147,7 +151,12 @@ def _in_beam(planes: Planes, prefixes: Prefixes, row: Tensor, face: Tensor) -> B
 
 
 def _planar_chains(
-    planes: Planes, prefixes: Prefixes, t: int, rx_position: Tensor, quality: Quality, budget: Budget
+    planes: Planes,
+    prefixes: Prefixes,
+    t: int,
+    rx_position: Tensor,
+    quality: Quality,
+    budget: Budget,
 ) -> Chains:
     """Prefixes whose last face mirrors the image onto a receiver through its rectangle."""
     p, r = len(prefixes.image), len(rx_position)
@@ -213,14 +222,23 @@ def _glint_chains(
     parts = []
     for i, before in enumerate(fore):
         for j, after in enumerate(aft):
-            if i + j + 1 > quality.depth or not len(before.image) or not len(after.image):
+            if i + j + 1 > min(quality.depth, quality.curved_depth) or not len(before.image) or not len(after.image):
                 continue
             pair, sample = _glints(item, before.image, after.image, quality, budget)
             if not len(pair):
                 continue
             n = len(after.image)
             parts.append(
-                _glint_part(planes, item, before.take(pair // n), after.take(pair % n), sample, t, r, quality)
+                _glint_part(
+                    planes,
+                    item,
+                    before.take(pair // n),
+                    after.take(pair % n),
+                    sample,
+                    t,
+                    r,
+                    quality,
+                )
             )
     return _join(parts, quality.depth, item.point.device) if parts else None
 
@@ -234,8 +252,10 @@ def _glints(
     none = torch.zeros(0, dtype=torch.int64, device=fore.device)
     found = [(none, none)]
     block = max(1, 2_000_000 // s)
-    towards_aft = unit(aft[:, None] - item.point[None])
-    towards_fore = unit(fore[:, None] - item.point[None])
+    to_fore, to_aft = fore[:, None] - item.point[None], aft[:, None] - item.point[None]
+    towards_fore, towards_aft = unit(to_fore), unit(to_aft)
+    near_fore = 1.0 / to_fore.norm(dim=-1).clamp(min=1e-9)
+    near_aft = 1.0 / to_aft.norm(dim=-1).clamp(min=1e-9)
     for begin in range(0, pairs, block):
         pair = torch.arange(begin, min(pairs, begin + block), device=fore.device)
         a, b = towards_fore[pair // len(aft)], towards_aft[pair % len(aft)]
@@ -244,7 +264,9 @@ def _glints(
         both = a + b
         height = (both * item.normal).sum(-1)
         slope = torch.sqrt(torch.clamp((both * both).sum(-1) - height**2, min=0.0))
-        score = torch.where(lit, -slope, torch.full_like(slope, -4.0))
+        # slope / bend of the length is how far away, at least, the glint is
+        bend = near_fore[pair // len(aft)] + near_aft[pair % len(aft)] + 2.0 * item.curvature
+        score = torch.where(lit, -slope / (bend * item.reach), torch.full_like(slope, -torch.inf))
         found.append(_best_of_patch(item, pair, score))
     pair, sample = (torch.cat(c) for c in zip(*found, strict=True))
     return pair, sample
@@ -253,11 +275,9 @@ def _glints(
 def _best_of_patch(item: Samples, pair: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
     """In each patch the best sample, if it is good, and better than all samples near it elsewhere."""
     patches, column = torch.unique(item.patch, return_inverse=True)
-    best = torch.full((len(pair), len(patches)), -4.0, dtype=score.dtype, device=score.device)
+    best = torch.full((len(pair), len(patches)), -torch.inf, dtype=score.dtype, device=score.device)
     best = best.scatter_reduce(1, column.expand(len(pair), -1), score, "amax")
-    row, sample = torch.nonzero(
-        (score > -STEEP) & (score == best[:, column]), as_tuple=True
-    )
+    row, sample = torch.nonzero((score > -NEAR) & (score == best[:, column]), as_tuple=True)
     keep = ~_outdone(item, row, sample, score)
     return pair[row[keep]], sample[keep]
 
@@ -294,23 +314,32 @@ def _glint_part(
 ) -> Chains:
     """Chains of one length, seeded by the image method on either side of the sample."""
     x = item.point[sample]
-    fore = _unfold(planes, before, x)
-    aft = _unfold(planes, after, x).flip(1)
+    # the glint may lie a few samples away, and its mirror images as far along their faces
+    slack = 2.0 * NEAR * item.reach[sample]
+    fore, on_fore = _unfold(planes, before, x, slack)
+    aft, on_aft = _unfold(planes, after, x, slack)
+    aft = aft.flip(1)
     c = len(sample)
     node = torch.full((c, 1), item.node, dtype=torch.int64, device=x.device)
     back = after.faces.flip(1)
     which = torch.cat([planes.node[before.faces], node, planes.node[back]], 1)
-    patch = torch.cat([planes.patch[before.faces], item.patch[sample][:, None], planes.patch[back]], 1)
+    patch = torch.cat(
+        [planes.patch[before.faces], item.patch[sample][:, None], planes.patch[back]], 1
+    )
     seed = torch.cat([fore, x[:, None], aft], 1)
-    good = torch.isfinite(seed).all(-1).all(-1)
+    good = on_fore & on_aft & torch.isfinite(seed).all(-1).all(-1)
     ends = torch.full((c,), t, device=x.device), torch.full((c,), r, device=x.device)
     chains = Chains(ends[0], ends[1], which, patch, seed)
     return _padded(_take(chains, torch.nonzero(good).squeeze(-1)), quality.depth)
 
 
-def _unfold(planes: Planes, prefixes: Prefixes, target: Tensor) -> Float[Tensor, "c d 3"]:
-    """Where the path from a source through its prefix of mirrors to a target meets the mirrors."""
+def _unfold(
+    planes: Planes, prefixes: Prefixes, target: Tensor, slack: Float[Tensor, "c"]
+) -> tuple[Float[Tensor, "c d 3"], Bool[Tensor, "c"]]:
+    """Where the path from a source through its mirrors to a target meets them, and whether it meets
+    each within its rectangle, give or take ``slack`` [m]."""
     image, points = prefixes.image, []
+    on = torch.ones(len(image), dtype=torch.bool, device=image.device)
     for level in range(prefixes.faces.shape[1] - 1, -1, -1):
         face = prefixes.faces[:, level]
         near = (image * planes.normal[face]).sum(-1) - planes.offset[face]
@@ -318,11 +347,13 @@ def _unfold(planes: Planes, prefixes: Prefixes, target: Tensor) -> Float[Tensor,
         slope = near - far
         share = near / torch.where(slope == 0, torch.ones_like(slope), slope)
         target = image + share[:, None] * (target - image)
+        uv = torch.einsum("cj,cij->ci", target - planes.centre[face], planes.edges[face]).abs()
+        on &= (near < 0) & (far > -slack) & (uv <= planes.half[face] + slack[:, None]).all(-1)
         points.insert(0, target)
         image = _mirror(planes, image, face)
     if not points:
-        return image.new_zeros(len(image), 0, 3)
-    return torch.stack(points, 1)
+        return image.new_zeros(len(image), 0, 3), on
+    return torch.stack(points, 1), on
 
 
 def _chains(planes: Planes, t: int, rx: Tensor, face: Tensor, seed: Tensor, depth: int) -> Chains:

@@ -9,13 +9,12 @@ function theorem), so paths are differentiable in poses, shapes, radios and netw
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from rfsg.objects.contract import Jet
 from rfsg.scene.world import World, unit
 from rfsg.tracer import zone
 from rfsg.tracer.implicit import (
@@ -25,33 +24,13 @@ from rfsg.tracer.implicit import (
     solve_regular,
     spreading,
 )
+from rfsg.tracer.newton import Batch, Surfaces, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains, Paths, Status
+from rfsg.tracer.settle import Charts, settle, tolerance
 from rfsg.tracer.zone import Facets
 
-ON_SURFACE = 1e-7  # of the object's size: a polished vertex is orders closer, an edge passed is not
-SETTLED = 1e-9  # [m] a vertex moves less than this between rounds: phase to 1e-6 rad at 30 GHz
-NEWTON_SETTLED = 1e-11  # of the path's length: the last Newton step of a converged chain
 GRAZING = 1e-9  # cosine below which a path runs along a face and is not reflected by it
-
-
-@dataclass
-class Batch:
-    """Chains of one depth on their way to paths; every field has the chain axis first."""
-
-    index: Int[Tensor, "c"]
-    tx: Float[Tensor, "c 3"]
-    rx: Float[Tensor, "c 3"]
-    which: Int[Tensor, "c d"]
-    patch: Int[Tensor, "c d"]
-    x: Float[Tensor, "c d 3"]
-
-    def take(self, i: Tensor) -> "Batch":
-        return Batch(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
-
-    def polyline(self, x: Tensor | None = None) -> Float[Tensor, "c v 3"]:
-        x = self.x if x is None else x
-        return torch.cat([self.tx[:, None], x, self.rx[:, None]], 1)
 
 
 @dataclass(frozen=True)
@@ -120,9 +99,7 @@ def _solve_depth(world: World, batch: Batch, wavelength: float, quality: Quality
     return result
 
 
-def _merge(
-    c: int, jobs: list[tuple[Tensor, Callable[[Batch], Solved]]], batch: Batch
-) -> Solved:
+def _merge(c: int, jobs: list[tuple[Tensor, Callable[[Batch], Solved]]], batch: Batch) -> Solved:
     done = [(i, job(batch.take(i))) for i, job in jobs if len(i)]
     order = torch.argsort(torch.cat([i for i, _ in done]))
     assert len(order) == c
@@ -184,84 +161,77 @@ def _images(world: World, batch: Batch) -> Solved:
 # anything else: Newton on the Lagrangian
 
 
-@dataclass(frozen=True)
-class Surfaces:
-    """The local models of a batch's vertices: planes, exact shapes, or measured facets (flat [c d])."""
-
-    world: World
-    which: Int[Tensor, "m"]
-    planar: Bool[Tensor, "m"]
-    plane_normal: Float[Tensor, "m 3"]
-    plane_offset: Float[Tensor, "m"]
-    learned: Bool[Tensor, "m"]
-    facets: Facets | None
-
-    def jet(self, x: Float[Tensor, "c d 3"]) -> Jet:
-        flat = x.reshape(-1, 3)
-        value = (flat * self.plane_normal).sum(-1) - self.plane_offset
-        gradient, hessian = self.plane_normal, flat.new_zeros(len(flat), 3, 3)
-        i = torch.nonzero(~self.planar & ~self.learned).squeeze(-1)
-        if len(i):
-            j = self.world.jet(self.which[i], flat[i])
-            value, gradient = value.index_copy(0, i, j.value), gradient.index_copy(0, i, j.gradient)
-            hessian = hessian.index_copy(0, i, j.hessian)
-        if self.facets is not None:
-            i = torch.nonzero(self.learned).squeeze(-1)
-            j = self.facets.jet(flat[i])
-            value, gradient = value.index_copy(0, i, j.value), gradient.index_copy(0, i, j.gradient)
-            hessian = hessian.index_copy(0, i, j.hessian)
-        c, d = x.shape[:2]
-        return Jet(value.reshape(c, d), gradient.reshape(c, d, 3), hessian.reshape(c, d, 3, 3))
-
-
-def _surfaces(world: World, batch: Batch, facets: Facets | None) -> Surfaces:
-    which, patch = batch.which.reshape(-1), batch.patch.reshape(-1)
-    normal, offset, planar = world.plane(which, patch)
-    return Surfaces(world, which, planar, normal, offset, ~world.exact[which], facets)
-
-
 def _stationary(world: World, batch: Batch, wavelength: float, quality: Quality) -> Solved:
     with torch.no_grad():
-        detached = Batch(
-            batch.index,
-            batch.tx.detach(),
-            batch.rx.detach(),
-            batch.which,
-            batch.patch,
-            batch.x.detach(),
-        )
-        x, status, charts = _search(world, detached, wavelength, quality)
+        loose = replace(batch, tx=batch.tx.detach(), rx=batch.rx.detach(), x=batch.x.detach())
+        x, status, charts = _rest(world, loose, wavelength, quality)
         batch.x = x
-    learned = ~world.exact[batch.which.reshape(-1)]
-    facets = None
-    if bool(learned.any()):
-        # measured once more where the vertex came to rest, this time with gradients if wanted
-        i = torch.nonzero(learned).squeeze(-1)
-        facets = zone.measure(
-            world,
-            batch.which.reshape(-1)[i],
-            charts.centre.reshape(-1, 3)[i],
-            charts.normal.reshape(-1, 3)[i],
-            charts.radius.reshape(-1)[i],
-            wavelength,
-            quality.zone_rings,
-        )
-    surfaces = _surfaces(world, batch, facets)
-    x = _implicit_step(batch, surfaces)
-    vertices = batch.polyline(x)
-    jet = surfaces.jet(x)
+    found = torch.nonzero(status == int(Status.OK)).squeeze(-1)
+    part, charts = batch.take(found), charts.take(found)
+    facets = _last_measure(world, part, charts, wavelength, quality)
+    surfaces = surfaces_of(world, part, facets)
+    vertices = part.polyline(_implicit_step(part, surfaces))
+    jet = surfaces.jet(vertices[:, 1:-1])
     cap = torch.tensor(1.0 / wavelength, dtype=x.dtype, device=x.device)
     lam = multipliers(segments(vertices)[1], jet.gradient)
     spread, capped, regular = spreading(vertices, jet, lam, cap)
     normal = unit(jet.gradient)
     with torch.no_grad():
-        valid = _validate(world, batch, vertices, normal, facets, wavelength)
-        status = torch.where(status == int(Status.OK), valid, status)
-        good = status == int(Status.OK)
-        status = torch.where(good & ~regular, int(Status.DEGENERATE), status)
-        status = torch.where(good & regular & capped, int(Status.CAUSTIC_CAPPED), status)
-        status = _duplicates(batch, vertices, charts.radius, status)
-    return Solved(vertices, normal, spread, status)
+        outcome = _validate(world, part, vertices, normal, facets, wavelength)
+        good = outcome == int(Status.OK)
+        outcome = torch.where(good & ~regular, int(Status.DEGENERATE), outcome)
+        outcome = torch.where(good & regular & capped, int(Status.CAUSTIC_CAPPED), outcome)
+        status[found] = _duplicates(part, vertices, charts.radius, outcome)
+    return Solved(
+        batch.polyline().index_copy(0, found, vertices),
+        torch.zeros_like(batch.x).index_copy(0, found, normal),
+        torch.zeros_like(batch.x[:, 0, 0]).index_copy(0, found, spread),
+        status,
+    )
+
+
+def _rest(
+    world: World, batch: Batch, wavelength: float, quality: Quality
+) -> tuple[Tensor, Tensor, Charts]:
+    """Vertices at rest, status and charts: exact chains by Newton alone, learned ones settle."""
+    learned = (~world.exact[batch.which]).any(1)
+    exact = torch.nonzero(~learned).squeeze(-1)
+    x = batch.x.clone()
+    status = torch.full((len(x),), int(Status.NOT_CONVERGED), device=x.device)
+    charts = Charts(x.clone(), torch.zeros_like(x), torch.zeros_like(x[..., 0]))
+    if len(exact):
+        part = batch.take(exact)
+        # no round measures again, so Newton has them all to itself
+        x[exact], settled = newton(part, surfaces_of(world, part, None), 3 * quality.newton)
+        status[exact] = torch.where(settled, int(Status.OK), int(Status.NOT_CONVERGED))
+    i = torch.nonzero(learned).squeeze(-1)
+    if len(i):
+        x[i], status[i], found = settle(world, batch.take(i), wavelength, quality)
+        charts.centre[i], charts.normal[i], charts.radius[i] = (
+            found.centre,
+            found.normal,
+            found.radius,
+        )
+    return x, status, charts
+
+
+def _last_measure(
+    world: World, batch: Batch, charts: "Charts", wavelength: float, quality: Quality
+) -> Facets | None:
+    """Facets where learned vertices came to rest, this time with gradients if they are wanted."""
+    which = batch.which.reshape(-1)
+    i = torch.nonzero(~world.exact[which]).squeeze(-1)
+    if not len(i):
+        return None
+    return zone.measure(
+        world,
+        which[i],
+        charts.centre.reshape(-1, 3)[i],
+        charts.normal.reshape(-1, 3)[i],
+        charts.radius.reshape(-1)[i],
+        wavelength,
+        quality.zone_rings,
+    )
 
 
 def _implicit_step(batch: Batch, surfaces: Surfaces) -> Tensor:
@@ -275,152 +245,6 @@ def _implicit_step(batch: Batch, surfaces: Surfaces) -> Tensor:
     step, _ = solve_regular(matrix, residual[..., None])
     depth = batch.which.shape[1]
     return batch.x - step[:, : 3 * depth, 0].reshape(-1, depth, 3)
-
-
-@dataclass(frozen=True)
-class Charts:
-    """Where each vertex's surface was measured: centre, normal and zone radius."""
-
-    centre: Float[Tensor, "c d 3"]
-    normal: Float[Tensor, "c d 3"]
-    radius: Float[Tensor, "c d"]
-
-
-def _search(
-    world: World, batch: Batch, wavelength: float, quality: Quality
-) -> tuple[Tensor, Tensor, Charts]:
-    """Vertices [c d 3] at rest, status [c] and the charts they rest on (no gradients)."""
-    c, depth = batch.which.shape
-    x = batch.x.clone()
-    status = torch.full((c,), int(Status.NOT_CONVERGED), device=x.device)
-    learned = ~world.exact[batch.which]
-    flat = batch.which.reshape(-1)
-    normal = world.normal(flat, x.reshape(-1, 3)).reshape(c, depth, 3)
-    charts = Charts(x.clone(), normal, torch.zeros_like(x[..., 0]))
-    exact = torch.nonzero(~learned.any(1)).squeeze(-1)
-    if len(exact):
-        part = batch.take(exact)
-        x[exact], settled = _newton(part, _surfaces(world, part, None), 3 * quality.newton)
-        status[exact] = torch.where(settled, int(Status.OK), int(Status.NOT_CONVERGED))
-    rest = torch.nonzero(learned.any(1)).squeeze(-1)
-    curvature = torch.zeros_like(charts.radius)
-    for round_ in range(quality.refits):
-        if not len(rest):
-            break
-        precise = round_ >= 2
-        part = batch.take(rest)
-        part.x = x[rest]
-        facets, radius = _measure(
-            world, part, charts.normal[rest], curvature[rest], learned[rest], wavelength, quality,
-            torch.float64 if precise else torch.float32,
-        )  # fmt: skip
-        charts.centre[rest], charts.radius[rest] = part.x, radius
-        surfaces = _surfaces(world, part, facets)
-        moved, settled = _newton(part, surfaces, quality.newton)
-        step = (moved - part.x).norm(dim=-1).amax(-1)
-        gradient = surfaces.jet(moved).gradient
-        bend = torch.zeros_like(radius).reshape(-1)
-        bend[learned[rest].reshape(-1)] = facets.curvature()
-        # the charts that decide this round stay as they are; the next round's begin where it ended
-        at_rest = precise & settled & (step < SETTLED)
-        lost = _lost(world, part, moved, facets, learned[rest], settled, precise, wavelength)
-        status[rest[at_rest]] = int(Status.OK)
-        status[rest[lost > 0]] = lost[lost > 0]
-        x[rest] = moved
-        go = ~at_rest & (lost == 0)
-        curvature[rest] = bend.reshape(radius.shape)
-        keep = rest[go]
-        charts.normal[keep] = unit(gradient[go])
-        rest = keep
-    return x, status, charts
-
-
-def _measure(
-    world: World,
-    batch: Batch,
-    normal: Tensor,
-    curvature: Tensor,
-    learned: Tensor,
-    wavelength: float,
-    quality: Quality,
-    dtype: torch.dtype,
-) -> tuple[Facets, Tensor]:
-    """Facets of the learned vertices (flat) and every vertex's zone radius [c d]."""
-    length, u = segments(batch.polyline())
-    before = torch.cumsum(length, 1)[:, :-1]
-    after = length.sum(1, keepdim=True) - before
-    cosine = (u[:, :-1] * normal).sum(-1).abs()
-    radius = zone.zone_radius(before, after, cosine, curvature, wavelength)
-    i = torch.nonzero(learned.reshape(-1)).squeeze(-1)
-    facets = zone.measure(
-        world,
-        batch.which.reshape(-1)[i],
-        batch.x.reshape(-1, 3)[i],
-        normal.reshape(-1, 3)[i],
-        radius.reshape(-1)[i],
-        wavelength,
-        quality.zone_rings,
-        dtype,
-    )
-    return facets, radius
-
-
-def _lost(
-    world: World,
-    batch: Batch,
-    moved: Tensor,
-    facets: Facets,
-    learned: Tensor,
-    settled: Tensor,
-    precise: bool,
-    wavelength: float,
-) -> Tensor:
-    """Why a chain is given up early (a Status), 0 while there is hope: most candidates end here."""
-    c, depth = batch.which.shape
-    hopeless = torch.zeros(c, dtype=torch.int64, device=moved.device)
-    unresolved = torch.zeros_like(learned.reshape(-1))
-    unresolved[learned.reshape(-1)] = ~facets.resolved(wavelength)
-    if precise:
-        hopeless[unresolved.reshape(c, depth).any(1)] = int(Status.UNRESOLVED)
-        hopeless[~settled] = int(Status.NOT_CONVERGED)
-    which = batch.which.reshape(-1)
-    f = world.sdf(which, moved.reshape(-1, 3), torch.float32).abs().reshape(c, depth)
-    # a stationary point off the object by a tenth of its size is another object's business
-    slack = 0.1 * world.size[batch.which] if not precise else 2.0 * _tolerance(world, batch, wavelength)
-    off = (f > slack) & learned
-    hopeless[off.any(1) | ~torch.isfinite(moved).all(-1).all(-1)] = int(Status.OFF_SURFACE)
-    return hopeless
-
-
-def _tolerance(world: World, batch: Batch, wavelength: float) -> Tensor:
-    """How far a vertex may lie from f = 0 [m], per vertex."""
-    exact = ON_SURFACE * torch.clamp(world.size[batch.which], min=1.0)
-    relief = torch.full_like(exact, zone.RELIEF * wavelength)
-    return torch.where(world.exact[batch.which], exact, torch.minimum(relief, 0.05 * world.size[batch.which]))
-
-
-def _newton(batch: Batch, surfaces: Surfaces, rounds: int) -> tuple[Tensor, Tensor]:
-    """Newton on the Lagrangian from batch.x, steps held to half the shortest neighbouring segment."""
-    x = batch.x
-    c, depth = batch.which.shape
-    settled = torch.zeros(c, dtype=torch.bool, device=x.device)
-    for _ in range(rounds):
-        vertices = batch.polyline(x)
-        length, u = segments(vertices)
-        jet = surfaces.jet(x)
-        system = kkt(vertices, jet, multipliers(u, jet.gradient))
-        step, regular = solve_regular(system.matrix, system.residual[..., None])
-        dx = -step[:, : 3 * depth, 0].reshape(c, depth, 3)
-        # no further than half a segment, nor than half a radius of curvature: Newton's model ends there
-        bend = jet.hessian.flatten(2).norm(dim=-1).clamp(min=1e-300)
-        reach = 0.5 * torch.minimum(torch.minimum(length[:, :-1], length[:, 1:]), 1.0 / bend)
-        size = dx.norm(dim=-1)
-        shrink = torch.where(size > reach, reach / size.clamp(min=1e-300), 1.0).amin(1)
-        x = x + shrink[:, None, None] * dx
-        settled = regular & (size.amax(1) <= NEWTON_SETTLED * length.sum(1))
-        if bool(settled.all()):
-            break
-    return x, settled
 
 
 # what makes a stationary point a path
@@ -442,7 +266,7 @@ def _validate(
         x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
         front = ((u[:, :-1] * normal).sum(-1) < -GRAZING) & ((u[:, 1:] * normal).sum(-1) > GRAZING)
         f = world.sdf(which, x).abs().reshape(c, depth)
-        on = f <= _tolerance(world, batch, wavelength)
+        on = f <= tolerance(world, batch, wavelength)
         exact = world.exact[which]
         # a planar face is itself alone; a curved surface may be sought from another of its pieces
         patch = world.patch(which, x)

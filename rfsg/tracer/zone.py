@@ -25,7 +25,7 @@ from rfsg.tracer.implicit import transverse
 
 RELIEF = 1.0 / 16.0  # of a wavelength: what a mirror may depart from its quadric (Rayleigh's half)
 ALIGNED = (0.64, 0.87)  # cosines of 50 and 30 degrees: below the first a sample is another face
-SHRINKS = (1.0, 0.5, 0.25, 0.125)  # zone radii tried, largest first
+SHRINKS = (1.0, 0.5, 0.25)  # zone radii tried, largest first
 LEAST_WEIGHT = 0.35  # share of a full zone's weight that must lie on the face
 
 
@@ -150,15 +150,17 @@ def _fit(
 def _drop(
     world: World, which: Tensor, base: Tensor, normal: Tensor, reach: Tensor, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Height of the zero set over base points along a normal, its alignment, and |f| left there."""
+    """Height of the zero set over base points along a normal, its alignment, and the |f| before the
+    last of three Newton steps: what finds no surface stays large."""
     height = base.new_zeros(len(base))
+    aligned = missed = height
     for _ in range(3):
         value, gradient = world.value_and_gradient(which, base + height[:, None] * normal, dtype)
         along = (gradient * normal).sum(-1)
         step = value / torch.where(along.abs() > 0.2, along, torch.ones_like(along))
         height = (height - step).clamp(-reach, reach)
-    value, gradient = world.value_and_gradient(which, base + height[:, None] * normal, dtype)
-    return height, (unit(gradient) * normal).sum(-1), value.abs()
+        aligned, missed = (unit(gradient) * normal).sum(-1), value.abs()
+    return height, aligned, missed
 
 
 def _smoothstep(x: Tensor, low: float, high: float) -> Tensor:

@@ -1,0 +1,93 @@
+"""Newton on the Lagrangian of a batch of chains: planes, exact shapes and measured facets alike."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from rfsg.objects.contract import Jet
+from rfsg.scene.world import World
+from rfsg.tracer.implicit import kkt, multipliers, segments, solve_regular
+from rfsg.tracer.zone import Facets
+
+NEWTON_SETTLED = 1e-11  # of the path's length: the last Newton step of a converged chain
+
+
+@dataclass
+class Batch:
+    """Chains of one depth on their way to paths; every field has the chain axis first."""
+
+    index: Int[Tensor, "c"]
+    tx: Float[Tensor, "c 3"]
+    rx: Float[Tensor, "c 3"]
+    which: Int[Tensor, "c d"]
+    patch: Int[Tensor, "c d"]
+    x: Float[Tensor, "c d 3"]
+
+    def take(self, i: Tensor) -> "Batch":
+        return Batch(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
+
+    def polyline(self, x: Tensor | None = None) -> Float[Tensor, "c v 3"]:
+        x = self.x if x is None else x
+        return torch.cat([self.tx[:, None], x, self.rx[:, None]], 1)
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The local models of a batch's vertices: planes, exact shapes, or measured facets (flat [c d])."""
+
+    world: World
+    which: Int[Tensor, "m"]
+    planar: Bool[Tensor, "m"]
+    plane_normal: Float[Tensor, "m 3"]
+    plane_offset: Float[Tensor, "m"]
+    learned: Bool[Tensor, "m"]
+    facets: Facets | None
+
+    def jet(self, x: Float[Tensor, "c d 3"]) -> Jet:
+        flat = x.reshape(-1, 3)
+        value = (flat * self.plane_normal).sum(-1) - self.plane_offset
+        gradient, hessian = self.plane_normal, flat.new_zeros(len(flat), 3, 3)
+        i = torch.nonzero(~self.planar & ~self.learned).squeeze(-1)
+        if len(i):
+            j = self.world.jet(self.which[i], flat[i])
+            value, gradient = value.index_copy(0, i, j.value), gradient.index_copy(0, i, j.gradient)
+            hessian = hessian.index_copy(0, i, j.hessian)
+        if self.facets is not None:
+            i = torch.nonzero(self.learned).squeeze(-1)
+            j = self.facets.jet(flat[i])
+            value, gradient = value.index_copy(0, i, j.value), gradient.index_copy(0, i, j.gradient)
+            hessian = hessian.index_copy(0, i, j.hessian)
+        c, d = x.shape[:2]
+        return Jet(value.reshape(c, d), gradient.reshape(c, d, 3), hessian.reshape(c, d, 3, 3))
+
+
+def surfaces_of(world: World, batch: Batch, facets: Facets | None) -> Surfaces:
+    which, patch = batch.which.reshape(-1), batch.patch.reshape(-1)
+    normal, offset, planar = world.plane(which, patch)
+    return Surfaces(world, which, planar, normal, offset, ~world.exact[which], facets)
+
+
+def newton(batch: Batch, surfaces: Surfaces, rounds: int) -> tuple[Tensor, Tensor]:
+    """Newton on the Lagrangian from batch.x, steps held to half the shortest neighbouring segment."""
+    x = batch.x
+    c, depth = batch.which.shape
+    settled = torch.zeros(c, dtype=torch.bool, device=x.device)
+    for _ in range(rounds):
+        vertices = batch.polyline(x)
+        length, u = segments(vertices)
+        jet = surfaces.jet(x)
+        system = kkt(vertices, jet, multipliers(u, jet.gradient))
+        step, regular = solve_regular(system.matrix, system.residual[..., None])
+        dx = -step[:, : 3 * depth, 0].reshape(c, depth, 3)
+        # no further than half a segment, nor than half a radius of curvature: Newton's model ends there
+        bend = jet.hessian.flatten(2).norm(dim=-1).clamp(min=1e-300)
+        reach = 0.5 * torch.minimum(torch.minimum(length[:, :-1], length[:, 1:]), 1.0 / bend)
+        size = dx.norm(dim=-1)
+        shrink = torch.where(size > reach, reach / size.clamp(min=1e-300), 1.0).amin(1)
+        x = x + shrink[:, None, None] * dx
+        settled = regular & (size.amax(1) <= NEWTON_SETTLED * length.sum(1))
+        if bool(settled.all()):
+            break
+    return x, settled

@@ -1,0 +1,234 @@
+"""Paths over learned surfaces come to rest: measure the zone, solve on the facet, measure again.
+
+The first look costs no network at all: the facets of an object's samples were measured once. Most
+candidates end there. Rounds then run in float32 until a vertex hardly moves, and in float64 until it
+stands still, so that the answer depends on where the path rests and not on where the search began:
+reciprocity is as exact as float64.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from rfsg.scene.world import World, unit
+from rfsg.tracer import zone
+from rfsg.tracer.faces import nearest_facets
+from rfsg.tracer.implicit import segments
+from rfsg.tracer.newton import Batch, newton, surfaces_of
+from rfsg.tracer.plan import Quality
+from rfsg.tracer.records import Status
+from rfsg.tracer.zone import Facets
+
+ON_SURFACE = 1e-7  # of the object's size: a polished vertex is orders closer, an edge passed is not
+SETTLED = 1e-9  # [m] a vertex moves less than this between rounds: phase to 1e-6 rad at 30 GHz
+EDGE_SLACK = 0.03  # [m] how far beyond a planar face's edge a vertex under way may be
+NEARLY = 2e-6  # [m] where float32's own rounding begins: float64 takes over
+PATIENCE = 5  # rounds after which a vertex must keep halving its steps, from
+RESTLESS = 0.05  # of its zone's radius: what does not is cycling between two views of a rough face
+SAME = 1e-3  # [m] chains of one sequence this close after two rounds are on their way to one path
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Where each vertex's surface was measured: centre, normal and zone radius."""
+
+    centre: Float[Tensor, "c d 3"]
+    normal: Float[Tensor, "c d 3"]
+    radius: Float[Tensor, "c d"]
+
+    def take(self, i: Tensor) -> "Charts":
+        return Charts(self.centre[i], self.normal[i], self.radius[i])
+
+
+@dataclass
+class State:
+    """Where the chains of a batch are; rows are changed in place as they move."""
+
+    x: Float[Tensor, "c d 3"]
+    status: Tensor
+    charts: Charts
+    curvature: Float[Tensor, "c d"]
+    before: Float[Tensor, "c d 3"]  # the change of the round before, for Aitken's step
+
+
+def settle(
+    world: World, batch: Batch, wavelength: float, quality: Quality
+) -> tuple[Float[Tensor, "c d 3"], Tensor, Charts]:
+    """Vertices at rest, status [c] and the charts they rest on, of chains with learned vertices."""
+    state = _start(world, batch)
+    rows = torch.arange(len(batch.x), device=world.device)
+    rows = _round(world, batch, state, rows, wavelength, quality, look=True)
+    rows = _rounds(world, batch, state, rows, wavelength, quality, torch.float32)
+    _rounds(world, batch, state, rows, wavelength, quality, torch.float64)
+    return state.x, state.status, state.charts
+
+
+def _start(world: World, batch: Batch) -> State:
+    c, depth = batch.which.shape
+    normal = world.normal(batch.which.reshape(-1), batch.x.reshape(-1, 3)).reshape(c, depth, 3)
+    flat = torch.zeros(c, depth, dtype=torch.float64, device=world.device)
+    status = torch.full((c,), int(Status.NOT_CONVERGED), device=world.device)
+    charts = Charts(batch.x.clone(), normal, flat)
+    return State(batch.x.clone(), status, charts, flat.clone(), torch.zeros_like(batch.x))
+
+
+def _rounds(
+    world: World,
+    batch: Batch,
+    state: State,
+    rows: Tensor,
+    wavelength: float,
+    quality: Quality,
+    dtype: torch.dtype,
+) -> Tensor:
+    """Rounds in one precision; returns the rows that came to rest in it."""
+    done = [rows[:0]]
+    for number in range(quality.refits):
+        if not len(rows):
+            break
+        going = _round(world, batch, state, rows, wavelength, quality, dtype=dtype, number=number)
+        rested = state.status[rows] == int(Status.OK)
+        done.append(rows[rested])
+        rows = going
+    ready = torch.cat(done)
+    if dtype != torch.float64:
+        state.status[ready] = int(Status.NOT_CONVERGED)  # until float64 has confirmed them
+    return ready
+
+
+def _round(
+    world: World,
+    batch: Batch,
+    state: State,
+    rows: Tensor,
+    wavelength: float,
+    quality: Quality,
+    *,
+    look: bool = False,
+    dtype: torch.dtype = torch.float32,
+    number: int = 0,
+) -> Tensor:
+    """One measurement and one solve of the rows given; returns those that go on."""
+    if not len(rows):
+        return rows
+    part = batch.take(rows)
+    part.x = state.x[rows]
+    learned = ~world.exact[part.which]
+    facets, radius = _measure(world, part, state, rows, wavelength, quality, look, dtype)
+    if not look:
+        state.charts.centre[rows], state.charts.radius[rows] = part.x, radius
+    surfaces = surfaces_of(world, part, facets)
+    moved, settled = newton(part, surfaces, quality.newton)
+    change = moved - part.x
+    step = change.norm(dim=-1).amax(-1)
+    precise = dtype == torch.float64
+    at_rest = (not look) & settled & (step < (SETTLED if precise else NEARLY))
+    lost = _lost(world, part, moved, facets, learned, settled, precise, wavelength)
+    restless = (step > RESTLESS * radius.amax(1) * 0.5 ** (number - PATIENCE)) & (number >= PATIENCE)
+    lost = torch.where(restless & (lost == 0), int(Status.NOT_CONVERGED), lost)
+    state.status[rows[at_rest]] = int(Status.OK)
+    state.status[rows[lost > 0]] = lost[lost > 0]
+    go = ~at_rest & (lost == 0)
+    if number in (2, 5) and not precise:
+        twin = _twins(part, moved) & go
+        state.status[rows[twin]] = int(Status.DUPLICATE)
+        go = go & ~twin
+    leap = (go & (number > 1))[:, None, None]
+    state.x[rows] = torch.where(leap, part.x + _extrapolated(change, state.before[rows]), moved)
+    state.before[rows] = change
+    bend = torch.zeros_like(radius).reshape(-1)
+    bend[learned.reshape(-1)] = facets.curvature()
+    state.curvature[rows] = bend.reshape(radius.shape)
+    # the charts on which a row came to rest stay; those of a row that goes on turn with its surface
+    state.charts.normal[rows[go]] = unit(surfaces.jet(moved).gradient[go])
+    return rows[go]
+
+
+def _twins(part: Batch, moved: Tensor) -> Tensor:
+    """All but the first of the chains of one sequence that have come to the same place."""
+    cell = torch.round(moved.flatten(1) / SAME).to(torch.int64)
+    ends = torch.round(torch.cat([part.tx, part.rx], 1) / SAME).to(torch.int64)
+    key = torch.cat([ends, part.which, cell], 1)
+    _, group = torch.unique(key, dim=0, return_inverse=True)
+    order = torch.argsort(group, stable=True)
+    twin = torch.zeros(len(group), dtype=torch.bool, device=group.device)
+    twin[order[1:]] = group[order[1:]] == group[order[:-1]]
+    return twin
+
+
+def _extrapolated(change: Tensor, before: Tensor) -> Tensor:
+    """Aitken's step: rounds that shrink by a steady factor are summed to their end at once."""
+    now, last = change.flatten(1), before.flatten(1)
+    square = (last * last).sum(1)
+    factor = (now * last).sum(1) / torch.where(square == 0, torch.ones_like(square), square)
+    factor = torch.where(square == 0, torch.zeros_like(factor), factor.clamp(-0.9, 0.8))
+    return change / (1.0 - factor)[:, None, None]
+
+
+def _measure(
+    world: World,
+    part: Batch,
+    state: State,
+    rows: Tensor,
+    wavelength: float,
+    quality: Quality,
+    look: bool,
+    dtype: torch.dtype,
+) -> tuple[Facets, Tensor]:
+    """Facets of the learned vertices (flat) and every vertex's zone radius [c d]."""
+    normal = state.charts.normal[rows]
+    length, u = segments(part.polyline())
+    before = torch.cumsum(length, 1)[:, :-1]
+    after = length.sum(1, keepdim=True) - before
+    cosine = (u[:, :-1] * normal).sum(-1).abs()
+    radius = zone.zone_radius(before, after, cosine, state.curvature[rows], wavelength)
+    which = part.which.reshape(-1)
+    i = torch.nonzero(~world.exact[which]).squeeze(-1)
+    point = part.x.reshape(-1, 3)[i]
+    if look:
+        return nearest_facets(world, which[i], point, wavelength), radius
+    direction, reach = normal.reshape(-1, 3)[i], radius.reshape(-1)[i]
+    rings = quality.zone_rings
+    return zone.measure(world, which[i], point, direction, reach, wavelength, rings, dtype), radius
+
+
+def _lost(
+    world: World,
+    batch: Batch,
+    moved: Tensor,
+    facets: Facets,
+    learned: Tensor,
+    settled: Tensor,
+    precise: bool,
+    wavelength: float,
+) -> Tensor:
+    """Why a chain is given up early (a Status), 0 while there is hope: most candidates end here."""
+    c, depth = batch.which.shape
+    hopeless = torch.zeros(c, dtype=torch.int64, device=moved.device)
+    unresolved = torch.zeros_like(learned.reshape(-1))
+    unresolved[learned.reshape(-1)] = ~facets.resolved(wavelength)
+    if precise:
+        hopeless[unresolved.reshape(c, depth).any(1)] = int(Status.UNRESOLVED)
+        hopeless[~settled] = int(Status.NOT_CONVERGED)
+    which = batch.which.reshape(-1)
+    f = world.sdf(which, moved.reshape(-1, 3), torch.float32).abs().reshape(c, depth)
+    # a stationary point off the object by a tenth of its size is another object's business
+    allowed = 2.0 * tolerance(world, batch, wavelength)
+    stride = (moved - batch.x).norm(dim=-1)
+    slack = allowed if precise else allowed + 0.03 * world.size[batch.which] + 0.1 * stride
+    # a mirror's own edge is as sharp as its object: an unfinished vertex may yet come back a little
+    near_edge = allowed if precise else EDGE_SLACK + 0.5 * stride
+    off = torch.where(learned, f > slack, f > near_edge)
+    hopeless[off.any(1) | ~torch.isfinite(moved).all(-1).all(-1)] = int(Status.OFF_SURFACE)
+    return hopeless
+
+
+def tolerance(world: World, batch: Batch, wavelength: float) -> Tensor:
+    """How far a vertex may lie from f = 0 [m], per vertex."""
+    exact = ON_SURFACE * torch.clamp(world.size[batch.which], min=1.0)
+    relief = torch.full_like(exact, zone.RELIEF * wavelength)
+    return torch.where(
+        world.exact[batch.which], exact, torch.minimum(relief, 0.05 * world.size[batch.which])
+    )
