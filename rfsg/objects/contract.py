@@ -60,6 +60,10 @@ class Shape(Protocol):
     convex: bool  # a line meets it in at most one stretch, and ``interval`` gives it in closed form
     exact: bool  # True: jets are the true surface. False: learned; it ripples, measure at the wave's scale
 
+    def config(self) -> dict[str, object]:
+        """What the constructor needs, as plain numbers, for files."""
+        ...
+
     def bounds(self) -> Float[Tensor, "2 3"]:
         """Lowest and highest corner [m]; infinite for an unbounded shape."""
         ...
@@ -105,6 +109,10 @@ class Surface(Protocol):
 
     kind: str  # token in files: "conductor", "halfspace", "slab", "stochastic"
     opaque: bool  # True: nothing ever comes through; the tracer stops there
+
+    def config(self) -> dict[str, object]:
+        """What the constructor needs, as plain numbers, for files."""
+        ...
 
     def reflection(
         self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]

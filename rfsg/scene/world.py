@@ -1,7 +1,8 @@
 """The scene asks its objects' questions, by index, in the world frame.
 
 World-to-object happens here and nowhere else, and so does grouping a batch: points of all nodes
-that share a shape or a surface go to it in one call. Frames are float64 always; a shape may be asked in float32.
+that share a shape or a surface go to it in one call. Frames are float64 always; a shape may be asked
+in float32.
 """
 
 import json
@@ -10,7 +11,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Contact, Crossing, Jet, Shape
@@ -31,7 +32,9 @@ class World:
         self.velocity = _stack([n.velocity for n in nodes], (3,), self.device)
         for body in {id(n.body): n.body for n in nodes}.values():
             body.to(self.device)
-        self.shapes, self.shape_of_node = _distinct([_shape_key(n.body) for n in nodes], self.device)
+        self.shapes, self.shape_of_node = _distinct(
+            [_shape_key(n.body) for n in nodes], self.device
+        )
         self.surfaces, self.surface_of_node = _distinct(
             [_surface_key(n.body) for n in nodes], self.device
         )
@@ -302,7 +305,7 @@ def _shape_key(body: Body) -> tuple[object, Shape | None]:
 def _surface_key(body: Body) -> tuple[object, Body]:
     """Known materials of equal constants answer alike; a learned one belongs to its shape."""
     surface = body.surface
-    learned = surface.kind == "stochastic" or any(p.requires_grad for p in surface.parameters())
-    if learned:
+    fitted = isinstance(surface, nn.Module) and any(p.requires_grad for p in surface.parameters())
+    if fitted or surface.kind == "stochastic":
         return (id(surface), id(body.shape)), body
     return (surface.kind, json.dumps(surface.config(), sort_keys=True)), body

@@ -17,6 +17,9 @@ class Field(nn.Module):
         super().__init__()
         self.f, self.half, self.lipschitz = f, torch.tensor(half, dtype=torch.float64), lipschitz
 
+    def config(self) -> dict[str, object]:
+        return {}
+
     def bounds(self) -> Tensor:
         return torch.stack([-self.half, self.half])
 
@@ -36,7 +39,9 @@ class Field(nn.Module):
             value = self.f(p)
             (gradient,) = torch.autograd.grad(value.sum(), p, create_graph=True)
             rows = [
-                torch.autograd.grad(gradient[..., k].sum(), p, retain_graph=True, allow_unused=True)[0]
+                torch.autograd.grad(
+                    gradient[..., k].sum(), p, retain_graph=True, allow_unused=True
+                )[0]
                 if gradient.requires_grad
                 else None
                 for k in range(3)

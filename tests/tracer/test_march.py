@@ -2,8 +2,6 @@
 
 import pytest
 import torch
-from tests.scenes import vector
-from tests.tracer.shapes import Field, ball, two_walls
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Box, Sphere
@@ -15,6 +13,8 @@ from rfsg.tracer.embree import Proxies
 from rfsg.tracer.launch import fibonacci
 from rfsg.tracer.march import EVALUATE, SEARCH, crossings
 from rfsg.tracer.records import Rays
+from tests.scenes import vector
+from tests.tracer.shapes import Field, ball, two_walls
 
 
 def _cross(shape, pose, origin, direction, limit, options):
@@ -53,7 +53,9 @@ def test_a_thing_met_twice_gives_two_stretches():
     shape = Field(two_walls(0.4, 0.05), [0.5, 0.5, 0.5])
     origin = vector(-2.0, 0.0, 0.0)[None]
     direction = vector(1.0, 0.0, 0.0)[None]
-    found = _cross(shape, Pose.identity(), origin, direction, torch.full((1,), torch.inf).double(), EVALUATE)
+    found = _cross(
+        shape, Pose.identity(), origin, direction, torch.full((1,), torch.inf).double(), EVALUATE
+    )
     expected = torch.tensor([1.75, 2.2], dtype=torch.float64)
     torch.testing.assert_close(found.enter, expected, atol=1e-9, rtol=0)
     torch.testing.assert_close(found.leave, expected + 0.05, atol=1e-9, rtol=0)
@@ -79,8 +81,12 @@ def test_segment_ends_inside():
         direction = vector(1.0, 0.0, 0.0).expand(2, 3)
         limit = torch.tensor([3.0, 2.0], dtype=torch.float64)
         found = _cross(shape, Pose.identity(), origin, direction, limit, EVALUATE)
-        torch.testing.assert_close(found.enter, torch.tensor([0.0, 1.5]).double(), atol=1e-9, rtol=0)
-        torch.testing.assert_close(found.leave, torch.tensor([0.5, 2.0]).double(), atol=1e-9, rtol=0)
+        torch.testing.assert_close(
+            found.enter, torch.tensor([0.0, 1.5]).double(), atol=1e-9, rtol=0
+        )
+        torch.testing.assert_close(
+            found.leave, torch.tensor([0.5, 2.0]).double(), atol=1e-9, rtol=0
+        )
         assert bool((found.normal_enter[0] == 0).all()) and bool((found.normal_leave[1] == 0).all())
         torch.testing.assert_close(found.normal_leave[0], vector(1.0, 0.0, 0.0))
         torch.testing.assert_close(found.normal_enter[1], vector(-1.0, 0.0, 0.0))

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from tests.scenes import box_node, vector
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import HalfSpace, Sphere
@@ -13,6 +12,7 @@ from rfsg.scene.world import World
 from rfsg.tracer.embree import Proxies, brute_spans
 from rfsg.tracer.launch import fibonacci
 from rfsg.tracer.records import Rays
+from tests.scenes import box_node, vector
 
 
 def _scenes():
@@ -33,7 +33,11 @@ def _scenes():
         box_node("/outer", (0, 0, 0), (2.0, 2.0, 2.0)),
         box_node("/middle", (0.5, 0, 0), (1.0, 1.0, 1.0), yaw_deg=30.0),
         Node("/inner", Body(Sphere(0.4), Conductor()), Pose.at(0.4, 0.1, 0.0)),
-        Node("/ground", Body(HalfSpace(), DielectricHalfSpace(eps_r=3.0, sigma=0.0)), Pose.at(0, 0, -3)),
+        Node(
+            "/ground",
+            Body(HalfSpace(), DielectricHalfSpace(eps_r=3.0, sigma=0.0)),
+            Pose.at(0, 0, -3),
+        ),
     )
     torch.manual_seed(3)
     crowd = tuple(
@@ -46,7 +50,11 @@ def _scenes():
         for k in range(60)
     )
     far = tuple(
-        Node(n.path, n.body, Pose(n.pose.rotation, n.pose.translation + vector(1e5, -2e5, 50.0), n.pose.scale))
+        Node(
+            n.path,
+            n.body,
+            Pose(n.pose.rotation, n.pose.translation + vector(1e5, -2e5, 50.0), n.pose.scale),
+        )
         for n in crowd
     )
     return {
@@ -79,5 +87,7 @@ def test_spans_are_complete(name):
 
 def test_no_objects():
     world = World(Scene(()))
-    rays = Rays(torch.zeros(5, 3, dtype=torch.float64), fibonacci(5), torch.full((5,), 3.0).double())
+    rays = Rays(
+        torch.zeros(5, 3, dtype=torch.float64), fibonacci(5), torch.full((5,), 3.0).double()
+    )
     assert len(Proxies(world).spans(rays).ray) == 0

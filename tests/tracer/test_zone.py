@@ -5,8 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.scenes import radio, vector
-from tests.tracer.shapes import Field, ball, rippled
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Sphere
@@ -18,6 +16,8 @@ from rfsg.tracer import zone
 from rfsg.tracer.channel import coefficients
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
+from tests.scenes import radio, vector
+from tests.tracer.shapes import Field, ball, rippled
 
 C = 299_792_458.0
 
@@ -41,7 +41,9 @@ def test_a_plane_comes_out_a_plane():
 
 def test_a_large_ball_keeps_its_curvature():
     radius = 2.0
-    found = _measure(Field(ball(radius), [2.1] * 3), vector(0, 0, radius), vector(0, 0, 1.0), 0.1, 0.12)
+    found = _measure(
+        Field(ball(radius), [2.1] * 3), vector(0, 0, radius), vector(0, 0, 1.0), 0.1, 0.12
+    )
     # the fit's fourth-order remainder on a sphere is of the order of (zone / radius)^2
     assert float(found.curvature()) == pytest.approx(1 / radius, rel=2 * (0.1 / radius) ** 2)
     assert abs(float(found.offset)) < 1e-6
@@ -96,16 +98,24 @@ def test_rippled_plate_reflects_as_physical_optics_says(frequency):
     """A 0.5 mm ripple of 20 cm on a metal plate: one path per mirror, its power within half a decibel
     in the mean over receivers (2.4 GHz), and near it where the ripple begins to be seen (28 GHz)."""
     amplitude, period, half = 2e-4 if frequency > 1e10 else 5e-4, 0.2, 5.0
-    plate = Node("/p", Body(Field(rippled(amplitude, period), [half, half, 0.2]), Conductor()), Pose.identity())
+    plate = Node(
+        "/p",
+        Body(Field(rippled(amplitude, period), [half, half, 0.2]), Conductor()),
+        Pose.identity(),
+    )
     tx = (-1.0, 0.0, 2.0)
     rxs = [(0.6 + 0.07 * k, 0.0, 1.5 + 0.05 * k) for k in range(8)]
-    scene = Scene((plate,), (radio("/t", *tx),), tuple(radio(f"/r{i}", *p) for i, p in enumerate(rxs)))
+    scene = Scene(
+        (plate,), (radio("/t", *tx),), tuple(radio(f"/r{i}", *p) for i, p in enumerate(rxs))
+    )
     result = simulate(scene, frequency, Quality(depth=1, rays=4000))
     reflected = (result.paths.which >= 0).any(1)
     counts = torch.bincount(result.paths.rx[reflected], minlength=len(rxs))
     assert counts.tolist() == [1] * len(rxs)
     found = coefficients(result.channel)[reflected, 0].abs().numpy()
-    truth = np.array([abs(_physical_optics(amplitude, period, half, tx, p, C / frequency)) for p in rxs])
+    truth = np.array(
+        [abs(_physical_optics(amplitude, period, half, tx, p, C / frequency)) for p in rxs]
+    )
     error = 20 * np.log10(found / truth)
     assert abs(error.mean()) < 0.5
     assert np.abs(error).max() < (0.6 if frequency < 1e10 else 1.5)
@@ -127,7 +137,9 @@ def test_learned_ball_reflects_as_the_exact_one():
 def test_reciprocity_on_learned_faces():
     """Swapping the ends changes no path gain: the zone is measured where the path rests, not where
     the search came from."""
-    plate = Node("/p", Body(Field(rippled(5e-4, 0.2), [1.5, 1.5, 0.2]), Conductor()), Pose.at(0, 0, 0, 20.0))
+    plate = Node(
+        "/p", Body(Field(rippled(5e-4, 0.2), [1.5, 1.5, 0.2]), Conductor()), Pose.at(0, 0, 0, 20.0)
+    )
     ends = (radio("/a", -0.8, 0.1, 1.7), radio("/b", 0.7, -0.2, 1.1))
     gains = []
     for tx, rx in (ends, ends[::-1]):

@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from tests.scenes import ROOM, box_node, radio, room
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Cylinder, HalfSpace, Sphere
@@ -17,6 +16,7 @@ from rfsg.scene.scene import Node, Scene
 from rfsg.tracer.channel import coefficients, power
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
+from tests.scenes import ROOM, box_node, radio, room
 
 C = 299_792_458.0
 EPS0 = 8.8541878128e-12  # [F/m], CODATA 2018
@@ -95,9 +95,7 @@ def _room_images(tx, rx, size, depth):
     for n in itertools.product(range(-depth, depth + 1), repeat=3):
         if sum(abs(k) for k in n) > depth:
             continue
-        image = [
-            size[a] * n[a] + (tx[a] if n[a] % 2 == 0 else size[a] - tx[a]) for a in range(3)
-        ]
+        image = [size[a] * n[a] + (tx[a] if n[a] % 2 == 0 else size[a] - tx[a]) for a in range(3)]
         delta = np.array(rx) - np.array(image)
         paths.append((np.linalg.norm(delta), np.abs(delta) / np.linalg.norm(delta), np.abs(n)))
     return paths
