@@ -1,0 +1,331 @@
+"""How fast is it here? Measures every stage and writes a page of tables.
+
+    python benchmarks/speed.py [--out docs/performance.md] [--quick]
+
+Every figure is a median of several runs, with the least and the most of them. Where two ways are
+compared they take turns, so that a machine that slows down slows both, and the ratio is that of each
+turn. Nothing is asserted: a page from one machine is no promise about another.
+"""
+
+import argparse
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from rfsg.objects.shapes.neural import NeuralShape
+from rfsg.scene.assets import load_asset
+from rfsg.scene.scene import Scene
+from rfsg.scene.world import World
+from rfsg.tracer.embree import Proxies, brute_spans
+from rfsg.tracer.launch import fibonacci
+from rfsg.tracer.march import EVALUATE, SEARCH, MarchOptions, march
+from rfsg.tracer.plan import Quality
+from rfsg.tracer.radiomap import radio_map
+from rfsg.tracer.records import Rays
+from rfsg.tracer.simulate import Result, simulate
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENE = ROOT / "assets" / "scenes" / "lab.usda"
+CABINET = ROOT / "assets" / "objects" / "cabinet" / "cabinet.usda"
+PAGE = ROOT / "docs" / "performance.md"
+RAYS = 100_000
+HITTING = 0.5  # share of the marched rays that are aimed to hit
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Several measurements of one thing."""
+
+    values: tuple[float, ...]
+
+    @property
+    def median(self) -> float:
+        return statistics.median(self.values)
+
+    def each(self, change: Callable[[float], float]) -> "Spread":
+        return Spread(tuple(change(v) for v in self.values))
+
+    def __str__(self) -> str:
+        low, middle, high = (_short(v) for v in (min(self.values), self.median, max(self.values)))
+        return f"{middle} ({low} to {high})"
+
+
+def _short(value: float) -> str:
+    for size, unit in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if abs(value) >= size:
+            return f"{value / size:.3g}{unit}"
+    return f"{value:.3g}"
+
+
+def seconds(work: Callable[[], object], runs: int, warm: bool = True) -> Spread:
+    """Wall time of each run [s]; ``warm`` runs it once before, unmeasured."""
+    if warm:
+        work()
+    return Spread(tuple(_once(work) for _ in range(runs)))
+
+
+def ratio(one: Callable[[], object], other: Callable[[], object], runs: int) -> list[Spread]:
+    """[time of one, time of other, other / one], taking turns."""
+    one(), other()
+    turns = [(_once(one), _once(other)) for _ in range(runs)]
+    first, second = zip(*turns, strict=True)
+    return [Spread(first), Spread(second), Spread(tuple(b / a for a, b in turns))]
+
+
+def _once(work: Callable[[], object]) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+@dataclass
+class Page:
+    """Markdown under way; a section is a heading, a sentence and a table."""
+
+    lines: list[str] = field(default_factory=list)
+
+    def section(self, heading: str, note: str, head: Sequence[str], rows: list[list[str]]) -> None:
+        print(f"-- {heading}", *(" | ".join(r) for r in rows), sep="\n", flush=True)
+        table = [head, ["---"] * len(head), *rows]
+        body = [f"| {' | '.join(row)} |" for row in table]
+        self.lines += [f"## {heading}", "", note, "", *body, ""]
+
+
+# what is measured
+
+
+def spans(page: Page, world: World, runs: int) -> None:
+    """Rays through the scene's proxies: Embree against every ray with every box."""
+    proxies = Proxies(world)
+    rays = _scattered(world, RAYS)
+    embree, brute, times = ratio(
+        lambda: proxies.spans(rays), lambda: brute_spans(world, rays), runs
+    )
+    rows = [
+        ["Embree spans", str(embree.each(lambda s: RAYS / s))],
+        ["every ray with every box", str(brute.each(lambda s: RAYS / s))],
+        ["Embree is faster by", str(times)],
+    ]
+    note = (
+        f"{RAYS:,} rays from within the lab ({len(world)} objects), each to its end with everything "
+        "on its way. Both give the same spans; for few objects the plain way may well be the faster."
+    )
+    page.section("Rays against proxies", note, ["way", "rays/s"], rows)
+
+
+def _scattered(world: World, count: int) -> Rays:
+    """Rays from random places inside the scene's extent, evenly over the sphere."""
+    proxies = Proxies(world)
+    corners = proxies.corners(proxies.owner).reshape(-1, 3)
+    low, high = corners.amin(0), corners.amax(0)
+    generator = torch.Generator().manual_seed(0)
+    share = torch.rand(count, 3, dtype=torch.float64, generator=generator)
+    limit = torch.full((count,), torch.inf, dtype=torch.float64)
+    return Rays(low + share * (high - low), fibonacci(count), limit)
+
+
+def marching(page: Page, shape: NeuralShape, runs: int, count: int) -> None:
+    """Sphere tracing through the cabinet, half of the rays hitting it."""
+    start, direction, length, share = _aimed(shape, count)
+    rows = []
+    for name, options in (("search, float32", SEARCH), ("evaluate, float64", EVALUATE)):
+        time_of = seconds(lambda o=options: march(shape, start, direction, length, o), runs)
+        rows.append([name, str(time_of.each(lambda s: count / s))])
+    note = (
+        f"{count:,} rays through the bounds of the trained cabinet, {100 * share:.0f} % of which go "
+        "through the cabinet itself; every boundary found and polished."
+    )
+    page.section("Sphere tracing of a neural shape", note, ["options", "rays/s"], rows)
+
+
+@torch.no_grad()
+def _aimed(shape: NeuralShape, count: int) -> tuple[Tensor, Tensor, Tensor, float]:
+    """Random chords of the bounds (start, direction, length), and the share of them that hits."""
+    low, high = shape.bounds()
+    generator = torch.Generator().manual_seed(0)
+    most = 4 * count
+    ends = torch.rand(2, most, 3, dtype=torch.float64, generator=generator)
+    axis = torch.randint(3, (2, most), generator=generator)
+    side = torch.randint(2, (2, most), generator=generator).double()
+    ends = ends.scatter(-1, axis[..., None], side[..., None])  # onto the faces of the unit cube
+    start, end = low + ends * (high - low)
+    away = end - start
+    length = away.norm(dim=-1)
+    some = torch.nonzero(length > 0.05 * length.max()).squeeze(-1)
+    direction = away[some] / length[some, None]
+    options = MarchOptions(step_floor=0.02)
+    row, _, _ = march(shape, start[some], direction, length[some], options)
+    hits = torch.zeros(len(some), dtype=torch.bool)
+    hits[row] = True
+    wanted = int(HITTING * count)
+    hit, miss = (torch.nonzero(x).squeeze(-1)[:wanted] for x in (hits, ~hits))
+    if len(hit) < wanted or len(miss) < count - wanted:
+        print(f"only {len(hit)} hits and {len(miss)} misses to draw from", file=sys.stderr)
+    chosen = torch.cat([hit, miss])[:count]
+    share = len(hit) / len(chosen)
+    return start[some][chosen], direction[chosen], length[some][chosen], share
+
+
+@torch.no_grad()
+def network(page: Page, shape: NeuralShape, runs: int, count: int) -> None:
+    """Evaluations of f, and of f with its gradient, against what the matrix product could do."""
+    low, high = shape.bounds()
+    point = low + (high - low) * torch.rand(count, 3, dtype=torch.float64)
+    work = 2.0 * sum(p.numel() for n, p in shape.named_parameters() if _counts(n))
+    size, rows = 512, []
+    for dtype in (torch.float32, torch.float64):
+        p = point.to(dtype)
+        a, b = torch.rand(2, size, size, dtype=dtype)
+        peak = seconds(lambda a=a, b=b: torch.mm(a, b), 3 * runs).each(lambda s: 2 * size**3 / s)
+        name = str(dtype).removeprefix("torch.")
+        rows.append([f"torch.mm, {name}", f"{peak} FLOP/s", "", ""])
+        ways = (("f", shape.sdf, 1), ("f and gradient", shape.value_and_gradient, 2))
+        for what, ask, sweeps in ways:
+            rate = seconds(lambda ask=ask, p=p: ask(p), runs).each(lambda s: count / s)
+            reached = rate.median * work * sweeps
+            share = 100 * reached / peak.median
+            rows.append(
+                [
+                    f"{what}, {name}",
+                    f"{rate} points/s",
+                    f"{_short(reached)}FLOP/s",
+                    f"{share:.0f} %",
+                ]
+            )
+    note = (
+        f"{count:,} points; FLOP counts matrix products alone ({work:,.0f} for f, twice that with "
+        "the gradient), so that the sines, the activations and the memory show as what is lost."
+    )
+    page.section("The network", note, ["what", "rate", "reached", "of torch.mm"], rows)
+
+
+def _counts(parameter: str) -> bool:
+    return parameter.endswith("weight") and "feature" not in parameter
+
+
+def stages(page: Page, scene: Scene, runs: int) -> None:
+    """simulate, stage by stage, at draft and standard."""
+    names = ("draft", "standard")
+    results: dict[str, list[Result]] = {}
+    for name in names:
+        simulate(scene, quality=name)  # fills what is kept between runs
+        results[name] = [simulate(scene, quality=name) for _ in range(runs)]
+    rows = []
+    for stage in results[names[0]][0].seconds:
+        times = [Spread(tuple(r.seconds[stage] for r in results[name])) for name in names]
+        rows.append([stage, *map(str, times)])
+    sums = [Spread(tuple(sum(r.seconds.values()) for r in results[name])) for name in names]
+    rows.append(["all", *map(str, sums)])
+    rows.append(["candidates", *(str(results[n][0].search.candidates) for n in names)])
+    rows.append(["paths", *(str(len(results[n][0].paths.tx)) for n in names)])
+    links = len(scene.transmitters) * len(scene.receivers)
+    note = f"The lab: {len(scene.nodes)} objects, {links} links, one frequency. Seconds."
+    page.section("A simulation", note, ["stage", *names], rows)
+
+
+def first_look(page: Page, scene: Scene) -> None:
+    """The first simulation of a process also samples and measures every learned shape."""
+    time_of = _once(lambda: simulate(scene, quality="draft"))
+    rows = [["first simulation, draft", _short(time_of)]]
+    note = "Once in a process: curved and learned faces are sampled, and kept. Seconds."
+    page.section("The first look", note, ["what", "s"], rows)
+
+
+def searches(page: Page, scene: Scene, runs: int) -> None:
+    """Enumeration against rays, whole simulations at draft."""
+    ways = [Quality.named("draft", search=name) for name in ("enumerate", "rays")]
+    results = [simulate(scene, quality=q) for q in ways]
+    one, other, times = ratio(
+        lambda: simulate(scene, quality=ways[0]), lambda: simulate(scene, quality=ways[1]), runs
+    )
+    rows = [
+        ["enumerate", str(one), str(results[0].search.candidates), str(len(results[0].paths.tx))],
+        ["rays", str(other), str(results[1].search.candidates), str(len(results[1].paths.tx))],
+        ["rays / enumerate", str(times), "", ""],
+    ]
+    note = (
+        "Whole simulations of the lab at draft, in turns. Seconds; enumeration misses no sequence."
+    )
+    page.section("Two ways to search", note, ["search", "s", "candidates", "paths"], rows)
+
+
+def the_rest(page: Page, scene: Scene, runs: int) -> None:
+    """Reading the scene, and a map."""
+    read = seconds(lambda: Scene.from_usd(SCENE), runs)
+    chart = seconds(lambda: radio_map(scene, quality="draft"), runs, warm=False)
+    cells = tuple(radio_map(scene, quality="draft", cell=0.5).path_gain.shape[1:])
+    rows = [
+        ["reading lab.usda with its four objects", str(read)],
+        [f"radio map, draft, {cells[0]} x {cells[1]} cells", str(chart)],
+    ]
+    page.section("Reading and maps", "Seconds.", ["what", "s"], rows)
+
+
+def peak_memory() -> float:
+    """Most memory that this process ever held [MiB] (Linux counts KiB, macOS bytes)."""
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return most / 2**20 if sys.platform == "darwin" else most / 2**10
+
+
+def _machine(runs: int) -> list[str]:
+    rows = {
+        "system": f"{platform.system()}, {platform.machine()}",
+        "processor": _processor(),
+        "cores": f"{os.cpu_count()}, {torch.get_num_threads()} of them used by torch",
+        "Python, torch": f"{platform.python_version()}, {torch.__version__}",
+        "runs": f"{runs}: median (least to most)",
+    }
+    return ["| machine | |", "| --- | --- |", *(f"| {k} | {v} |" for k, v in rows.items()), ""]
+
+
+def _processor() -> str:
+    """Its model, where the system tells."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or "not told"
+
+
+def main() -> None:
+    """Measure and write the page."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=PAGE)
+    parser.add_argument("--quick", action="store_true", help="fewer points; 3 runs of everything")
+    options = parser.parse_args()
+    runs, count = (3, 20_000) if options.quick else (5, 100_000)
+    scene = Scene.from_usd(SCENE)
+    shape = load_asset(CABINET).body.shape
+    assert isinstance(shape, NeuralShape)
+    page = Page()
+    first_look(page, scene)
+    stages(page, scene, 3)
+    searches(page, scene, 3)
+    the_rest(page, scene, 3)
+    spans(page, World(scene), runs)
+    network(page, shape, runs, count)
+    marching(page, shape, runs, count // 5)
+    head = [
+        "# Performance",
+        "",
+        "Written by `make bench` (`benchmarks/speed.py`) on one machine, not alone on it; another will",
+        "differ. Compare a change with the same machine's figures before it.",
+        "",
+    ]
+    tail = [f"Peak memory of the whole run: {peak_memory():.0f} MiB.", ""]
+    beside = options.out.with_name(options.out.name + ".part")
+    beside.write_text("\n".join([*head, *_machine(runs), *page.lines, *tail]))
+    beside.replace(options.out)
+    print(f"written: {options.out}")
+
+
+if __name__ == "__main__":
+    main()
