@@ -31,7 +31,7 @@ from rfsg.tracer.march import EVALUATE, SEARCH, MarchOptions, march
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.radiomap import radio_map
 from rfsg.tracer.records import Rays
-from rfsg.tracer.simulate import Result, simulate
+from rfsg.tracer.simulate import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "assets" / "scenes" / "lab.usda"
@@ -212,57 +212,42 @@ def _counts(parameter: str) -> bool:
     return parameter.endswith("weight") and "feature" not in parameter
 
 
-def stages(page: Page, scene: Scene, runs: int) -> None:
-    """simulate, stage by stage, at draft and standard."""
-    names = ("draft", "standard")
-    results: dict[str, list[Result]] = {}
-    for name in names:
-        simulate(scene, quality=name)  # fills what is kept between runs
-        results[name] = [simulate(scene, quality=name) for _ in range(runs)]
+def simulations(page: Page, scene: Scene, runs: int) -> None:
+    """simulate, stage by stage, at draft and standard, and at draft with either search; in turns."""
+    ways = {
+        "draft": Quality.named("draft", search="enumerate"),
+        "draft, by rays": Quality.named("draft", search="rays"),
+        "standard": Quality.named("standard"),
+    }
+    first = _once(lambda: simulate(scene, quality=ways["draft"]))
+    turns = [{name: simulate(scene, quality=q) for name, q in ways.items()} for _ in range(runs)]
     rows = []
-    for stage in results[names[0]][0].seconds:
-        times = [Spread(tuple(r.seconds[stage] for r in results[name])) for name in names]
-        rows.append([stage, *map(str, times)])
-    sums = [Spread(tuple(sum(r.seconds.values()) for r in results[name])) for name in names]
-    rows.append(["all", *map(str, sums)])
-    rows.append(["candidates", *(str(results[n][0].search.candidates) for n in names)])
-    rows.append(["paths", *(str(len(results[n][0].paths.tx)) for n in names)])
+    for stage in turns[0]["draft"].seconds:
+        rows.append(
+            [stage, *(str(Spread(tuple(t[n].seconds[stage] for t in turns))) for n in ways)]
+        )
+    whole = {name: [sum(t[name].seconds.values()) for t in turns] for name in ways}
+    rows.append(["all", *(str(Spread(tuple(times))) for times in whole.values())])
+    last = turns[-1]
+    rows.append(["sequences", *("all" if last[n].search.complete else "by rays" for n in ways)])
+    rows.append(["candidates", *(str(last[n].search.candidates) for n in ways)])
+    rows.append(["paths", *(str(len(last[n].paths.tx)) for n in ways)])
     links = len(scene.transmitters) * len(scene.receivers)
-    note = f"The lab: {len(scene.nodes)} objects, {links} links, one frequency. Seconds."
-    page.section("A simulation", note, ["stage", *names], rows)
-
-
-def first_look(page: Page, scene: Scene) -> None:
-    """The first simulation of a process also samples and measures every learned shape."""
-    time_of = _once(lambda: simulate(scene, quality="draft"))
-    rows = [["first simulation, draft", _short(time_of)]]
-    note = "Once in a process: curved and learned faces are sampled, and kept. Seconds."
-    page.section("The first look", note, ["what", "s"], rows)
-
-
-def searches(page: Page, scene: Scene, runs: int) -> None:
-    """Enumeration against rays, whole simulations at draft."""
-    ways = [Quality.named("draft", search=name) for name in ("enumerate", "rays")]
-    results = [simulate(scene, quality=q) for q in ways]
-    one, other, times = ratio(
-        lambda: simulate(scene, quality=ways[0]), lambda: simulate(scene, quality=ways[1]), runs
-    )
-    rows = [
-        ["enumerate", str(one), str(results[0].search.candidates), str(len(results[0].paths.tx))],
-        ["rays", str(other), str(results[1].search.candidates), str(len(results[1].paths.tx))],
-        ["rays / enumerate", str(times), "", ""],
-    ]
+    pairs = zip(whole["draft"], whole["draft, by rays"], strict=True)
+    times = Spread(tuple(rays / enumerated for enumerated, rays in pairs))
     note = (
-        "Whole simulations of the lab at draft, in turns. Seconds; enumeration misses no sequence."
+        f"The lab: {len(scene.nodes)} objects, {links} links, one frequency. Seconds. The first "
+        f"simulation of the process, which also samples and measures every learned face, took "
+        f"{_short(first)} s. By rays, draft takes {times} times as long as by enumeration."
     )
-    page.section("Two ways to search", note, ["search", "s", "candidates", "paths"], rows)
+    page.section("A simulation", note, ["stage", *ways], rows)
 
 
 def the_rest(page: Page, scene: Scene, runs: int) -> None:
     """Reading the scene, and a map."""
     read = seconds(lambda: Scene.from_usd(SCENE), runs)
+    cells = tuple(radio_map(scene, quality="draft").path_gain.shape[1:])
     chart = seconds(lambda: radio_map(scene, quality="draft"), runs, warm=False)
-    cells = tuple(radio_map(scene, quality="draft", cell=0.5).path_gain.shape[1:])
     rows = [
         ["reading lab.usda with its four objects", str(read)],
         [f"radio map, draft, {cells[0]} x {cells[1]} cells", str(chart)],
@@ -306,9 +291,7 @@ def main() -> None:
     shape = load_asset(CABINET).body.shape
     assert isinstance(shape, NeuralShape)
     page = Page()
-    first_look(page, scene)
-    stages(page, scene, 3)
-    searches(page, scene, 3)
+    simulations(page, scene, 3)
     the_rest(page, scene, 3)
     spans(page, World(scene), runs)
     network(page, shape, runs, count)
