@@ -18,6 +18,13 @@ from rfsg.tracer.records import Crossings, Rays, Spans
 
 MOST_ROOTS = 16  # boundaries of one object on one ray; a chair's back has about ten
 
+TOUCH = 1e-8  # [m] an end this near a boundary lies on it, as a foot on a floor: neither in nor out
+FORWARD = (
+    1.0,
+    0.7548776662466927,
+    0.5698402909980532,
+)  # no direction of a drawing is at right angles to it
+
 
 @dataclass(frozen=True)
 class MarchOptions:
@@ -53,8 +60,8 @@ def crossings(world: World, rays: Rays, spans: Spans, options: MarchOptions = SE
         which,
         enter,
         leave,
-        _zero_where(enter <= 0, normals[: len(ray)]),
-        _zero_where(leave >= rays.limit[ray], normals[len(ray) :]),
+        _zero_where(enter <= TOUCH, normals[: len(ray)]),
+        _zero_where(leave >= rays.limit[ray] - TOUCH, normals[len(ray) :]),
     )
 
 
@@ -92,11 +99,17 @@ def _learned(
     start = origin + (spans.enter / scale)[:, None] * direction
     length = (spans.leave - spans.enter) / scale
     found = []
+    # always marched from the same end, so that a hair's breadth of glass seen one way is seen the other
+    back = direction @ direction.new_tensor(FORWARD) < 0
+    start = torch.where(back[:, None], start + length[:, None] * direction, start)
+    direction = torch.where(back[:, None], -direction, direction)
     for shape, i in world.groups(which):
         row, t_in, t_out = march(shape, start[i], direction[i], length[i], options)
         k = i[row]
-        enter = spans.enter[k] + t_in * scale[k]
-        leave = spans.enter[k] + t_out * scale[k]
+        near = torch.where(back[k], length[k] - t_out, t_in)
+        far = torch.where(back[k], length[k] - t_in, t_out)
+        enter = spans.enter[k] + near * scale[k]
+        leave = spans.enter[k] + far * scale[k]
         # an end at the end of the segment is an end inside; one at the end of the box is a way out
         found.append(
             (spans.ray[k], which[k], enter, torch.minimum(leave, rays.limit[spans.ray[k]]))

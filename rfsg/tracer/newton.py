@@ -18,7 +18,6 @@ NEWTON_SETTLED = 1e-11  # of the path's length: the last Newton step of a conver
 class Batch:
     """Chains of one depth on their way to paths; every field has the chain axis first."""
 
-    index: Int[Tensor, "c"]
     tx: Float[Tensor, "c 3"]
     rx: Float[Tensor, "c 3"]
     which: Int[Tensor, "c d"]
@@ -27,6 +26,17 @@ class Batch:
 
     def take(self, i: Tensor) -> "Batch":
         return Batch(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
+
+    def turned(self, back: Bool[Tensor, "c"]) -> "Batch":
+        """The same chains, those in ``back`` read from the receiver."""
+        row, deep = back[:, None], back[:, None, None]
+        return Batch(
+            torch.where(row, self.rx, self.tx),
+            torch.where(row, self.tx, self.rx),
+            torch.where(row, self.which.flip(1), self.which),
+            torch.where(row, self.patch.flip(1), self.patch),
+            torch.where(deep, self.x.flip(1), self.x),
+        )
 
     def polyline(self, x: Tensor | None = None) -> Float[Tensor, "c v 3"]:
         x = self.x if x is None else x

@@ -36,7 +36,7 @@ class Quality:
     crossing_samples: int = 32
     integral: str = "telescoped"
     zone_rings: int = 2
-    refits: int = 20
+    refits: int = 16
     newton: int = 12
     map_rays: int = 100_000
     chunk: int = 65_536

@@ -222,7 +222,11 @@ def _glint_chains(
     parts = []
     for i, before in enumerate(fore):
         for j, after in enumerate(aft):
-            if i + j + 1 > min(quality.depth, quality.curved_depth) or not len(before.image) or not len(after.image):
+            if (
+                i + j + 1 > min(quality.depth, quality.curved_depth)
+                or not len(before.image)
+                or not len(after.image)
+            ):
                 continue
             pair, sample = _glints(item, before.image, after.image, quality, budget)
             if not len(pair):

@@ -126,7 +126,9 @@ def _round(
     precise = dtype == torch.float64
     at_rest = (not look) & settled & (step < (SETTLED if precise else NEARLY))
     lost = _lost(world, part, moved, facets, learned, settled, precise, wavelength)
-    restless = (step > RESTLESS * radius.amax(1) * 0.5 ** (number - PATIENCE)) & (number >= PATIENCE)
+    restless = (step > RESTLESS * radius.amax(1) * 0.5 ** (number - PATIENCE)) & (
+        number >= PATIENCE
+    )
     lost = torch.where(restless & (lost == 0), int(Status.NOT_CONVERGED), lost)
     state.status[rows[at_rest]] = int(Status.OK)
     state.status[rows[lost > 0]] = lost[lost > 0]
@@ -147,12 +149,13 @@ def _round(
 
 
 def _twins(part: Batch, moved: Tensor) -> Tensor:
-    """All but the first of the chains of one sequence that have come to the same place."""
+    """All but one of the chains of one sequence that have come to the same place."""
     cell = torch.round(moved.flatten(1) / SAME).to(torch.int64)
     ends = torch.round(torch.cat([part.tx, part.rx], 1) / SAME).to(torch.int64)
     key = torch.cat([ends, part.which, cell], 1)
     _, group = torch.unique(key, dim=0, return_inverse=True)
-    order = torch.argsort(group, stable=True)
+    order = torch.argsort(moved.flatten(1).sum(1), stable=True)  # whose turn it is says nothing
+    order = order[torch.argsort(group[order], stable=True)]
     twin = torch.zeros(len(group), dtype=torch.bool, device=group.device)
     twin[order[1:]] = group[order[1:]] == group[order[:-1]]
     return twin

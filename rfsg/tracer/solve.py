@@ -24,6 +24,7 @@ from rfsg.tracer.implicit import (
     solve_regular,
     spreading,
 )
+from rfsg.tracer.march import FORWARD
 from rfsg.tracer.newton import Batch, Surfaces, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains, Paths, Status
@@ -64,15 +65,29 @@ def solve(
     for depth in torch.unique(depth_of).tolist():
         for i in torch.nonzero(depth_of == depth).squeeze(-1).split(quality.chunk):
             batch = Batch(
-                i,
                 tx_position[chains.tx[i]],
                 rx_position[chains.rx[i]],
                 chains.which[i, :depth],
                 chains.patch[i, :depth],
                 chains.seed[i, :depth],
             )
-            parts.append((i, _pad(_solve_depth(world, batch, wavelength, quality), most)))
+            parts.append((i, _pad(_one_way(world, batch, wavelength, quality), most)))
     return _gather(world, chains, parts, most, wavelength, keep_failed)
+
+
+def _one_way(world: World, batch: Batch, wavelength: float, quality: Quality) -> Solved:
+    """Solve every chain from the same end, whichever end transmits: the same bits both ways.
+
+    Over a rough learned face Newton may find one of several glints; swapping transmitter and receiver
+    must not change which.
+    """
+    back = (batch.rx - batch.tx) @ batch.tx.new_tensor(FORWARD) < 0
+    solved = _solve_depth(world, batch.turned(back), wavelength, quality)
+    return replace(
+        solved,
+        vertices=torch.where(back[:, None, None], solved.vertices.flip(1), solved.vertices),
+        normal=torch.where(back[:, None, None], solved.normal.flip(1), solved.normal),
+    )
 
 
 def _solve_depth(world: World, batch: Batch, wavelength: float, quality: Quality) -> Solved:

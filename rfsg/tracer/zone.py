@@ -13,7 +13,7 @@ weight, smoothly) and shrinks where the relief leaves the quadric by more than l
 relief survives. Planes and spheres of radius large against rho come out unchanged.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -26,7 +26,11 @@ from rfsg.tracer.implicit import transverse
 RELIEF = 1.0 / 16.0  # of a wavelength: what a mirror may depart from its quadric (Rayleigh's half)
 ALIGNED = (0.64, 0.87)  # cosines of 50 and 30 degrees: below the first a sample is another face
 SHRINKS = (1.0, 0.5, 0.25)  # zone radii tried, largest first
-LEAST_WEIGHT = 0.35  # share of a full zone's weight that must lie on the face
+HELD = (
+    0.2,
+    0.45,
+)  # share of a full zone's weight on the face: below the first a zone is not believed
+LEAST_WEIGHT = 0.3  # between the two: less of a face than this is not a mirror
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ def measure(
     rings: int,
     dtype: torch.dtype = torch.float64,
 ) -> Facets:
-    """Fit the quadric of each vertex's zone; the largest of the zones tried that is a mirror.
+    """Fit the quadric of each vertex's zone: of the zones tried, largest first, those that are mirrors.
 
     ``dtype`` is the precision of the network's evaluation. Frames are laid out in the
     object's own frame, so moving the whole scene moves the answer and changes nothing else.
@@ -102,16 +106,46 @@ def measure(
     rows = transverse(normal_object)
     frame_object = torch.cat([rows, normal_object[:, None]], 1)
     frame = torch.stack([world.direction_world(which, frame_object[:, k]) for k in range(3)], 1)
-    best = _fit(world, which, centre, frame, radius, rings, dtype)
-    for shrink in SHRINKS[1:]:
-        again = torch.nonzero(~best.resolved(wavelength)).squeeze(-1)
-        if not len(again):
+    whole = _fit(world, which, centre, frame, radius, rings, dtype)
+    left = 1.0 - _trust(whole, wavelength)  # what smaller zones still have to say
+    whole = _scaled(whole, 1.0 - left)
+    for k, shrink in enumerate(SHRINKS[1:], 2):
+        i = torch.nonzero(left > 0).squeeze(-1)
+        if not len(i):
             break
-        smaller = _fit(
-            world, which[again], centre[again], frame[again], shrink * radius[again], rings, dtype
-        )
-        best = _put(best, again, smaller)
-    return best
+        smaller = _fit(world, which[i], centre[i], frame[i], shrink * radius[i], rings, dtype)
+        # the smallest takes what is left, trusted or not: ``resolved`` has the last word
+        trust = _trust(smaller, wavelength)
+        share = left[i] * (trust if k < len(SHRINKS) else torch.ones_like(trust))
+        whole = _added(whole, i, smaller, share)
+        left = left.index_copy(0, i, left[i] - share)
+    return whole
+
+
+def _trust(facets: Facets, wavelength: float) -> Float[Tensor, "m"]:
+    """From 0 to 1, smoothly: does the zone hold enough of the face, and is that a mirror?
+
+    Smooth, because a zone that switched its radius at a threshold would send a vertex back and forth.
+    """
+    held = _smoothstep(facets.weight, *HELD)
+    flat = _smoothstep(-facets.residual / (RELIEF * wavelength), -1.0, -0.5)
+    return held * flat
+
+
+BLENDED = ("offset", "slope", "bend", "residual", "weight", "radius")
+
+
+def _scaled(facets: Facets, share: Tensor) -> Facets:
+    return replace(facets, **{n: _times(getattr(facets, n), share) for n in BLENDED})
+
+
+def _added(whole: Facets, i: Tensor, part: Facets, share: Tensor) -> Facets:
+    added = {n: getattr(whole, n).index_add(0, i, _times(getattr(part, n), share)) for n in BLENDED}
+    return replace(whole, **added)
+
+
+def _times(x: Tensor, share: Tensor) -> Tensor:
+    return x * share.reshape(-1, *([1] * (x.dim() - 1)))
 
 
 def disc(rings: int, like: Tensor) -> Float[Tensor, "q 2"]:
@@ -206,15 +240,6 @@ def _least_squares(
 
 
 RIDGE = 1e-6
-
-
-def _put(whole: Facets, i: Tensor, part: Facets) -> Facets:
-    return Facets(
-        *(
-            getattr(whole, name).index_copy(0, i, getattr(part, name))
-            for name in Facets.__dataclass_fields__
-        )
-    )
 
 
 def take(facets: Facets, i: Tensor) -> Facets:
