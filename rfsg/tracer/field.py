@@ -174,7 +174,11 @@ def channel(
         )
         action = _scalar(world, paths, through, u, frequency) * antennas[:, None]
     gain = action * (wavelength / (4 * torch.pi))[None] * paths.spread[:, None]
-    delay = paths.length / SPEED_OF_LIGHT + _excess(world, through, len(paths.tx), frequency)
+    excess = _excess(world, through, len(paths.tx), frequency)
+    # T carries the phase of what was crossed; what moves into the delay leaves the gain
+    phase = 2.0 * torch.pi * frequency[None] * excess[:, None]
+    gain = gain * torch.polar(torch.ones_like(phase), phase)
+    delay = paths.length / SPEED_OF_LIGHT + excess
     blocked = torch.zeros(len(paths.tx), dtype=torch.bool, device=world.device)
     blocked[through.path[world.opaque[through.which]]] = True
     return Channel(

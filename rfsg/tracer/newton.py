@@ -12,6 +12,7 @@ from rfsg.tracer.implicit import kkt, multipliers, segments, solve_regular
 from rfsg.tracer.zone import Facets
 
 NEWTON_SETTLED = 1e-11  # of the path's length: the last Newton step of a converged chain
+ROUNDING = 64 * 2.0**-52  # of the coordinates: float64's own, through a Newton system
 
 
 @dataclass
@@ -97,7 +98,9 @@ def newton(batch: Batch, surfaces: Surfaces, rounds: int) -> tuple[Tensor, Tenso
         size = dx.norm(dim=-1)
         shrink = torch.where(size > reach, reach / size.clamp(min=1e-300), 1.0).amin(1)
         x = x + shrink[:, None, None] * dx
-        settled = regular & (size.amax(1) <= NEWTON_SETTLED * length.sum(1))
+        # coordinates far from the origin round coarser than the path is long
+        rounding = ROUNDING * vertices.abs().amax((1, 2))
+        settled = regular & (size.amax(1) <= NEWTON_SETTLED * length.sum(1) + rounding)
         if bool(settled.all()):
             break
     return x, settled

@@ -25,8 +25,8 @@ ON_SURFACE = 1e-7  # of the object's size: a polished vertex is orders closer, a
 SETTLED = 1e-9  # [m] a vertex moves less than this between rounds: phase to 1e-6 rad at 30 GHz
 EDGE_SLACK = 0.03  # [m] how far beyond a planar face's edge a vertex under way may be
 NEARLY = 2e-6  # [m] where float32's own rounding begins: float64 takes over
-PATIENCE = 5  # rounds after which a vertex must keep halving its steps, from
-RESTLESS = 0.05  # of its zone's radius: what does not is cycling between two views of a rough face
+PATIENCE = 5  # rounds after which a vertex must keep shrinking its steps, from
+RESTLESS, SHRINKING = 0.05, 0.7  # of its zone's radius: else it cycles between two views of a rough face
 SAME = 1e-3  # [m] chains of one sequence this close after two rounds are on their way to one path
 
 
@@ -126,7 +126,7 @@ def _round(
     precise = dtype == torch.float64
     at_rest = (not look) & settled & (step < (SETTLED if precise else NEARLY))
     lost = _lost(world, part, moved, facets, learned, settled, precise, wavelength)
-    restless = (step > RESTLESS * radius.amax(1) * 0.5 ** (number - PATIENCE)) & (
+    restless = (step > RESTLESS * radius.amax(1) * SHRINKING ** (number - PATIENCE)) & (
         number >= PATIENCE
     )
     lost = torch.where(restless & (lost == 0), int(Status.NOT_CONVERGED), lost)

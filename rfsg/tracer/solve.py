@@ -23,6 +23,7 @@ from rfsg.tracer.implicit import (
     segments,
     solve_regular,
     spreading,
+    transverse,
 )
 from rfsg.tracer.march import FORWARD
 from rfsg.tracer.newton import Batch, Surfaces, newton, surfaces_of
@@ -31,6 +32,7 @@ from rfsg.tracer.records import Chains, Paths, Status
 from rfsg.tracer.settle import Charts, settle, tolerance
 from rfsg.tracer.zone import Facets
 
+RIM = 1e-6  # of an object's size: the step that tells a rim from a bend
 GRAZING = 1e-9  # cosine below which a path runs along a face and is not reflected by it
 
 
@@ -288,7 +290,10 @@ def _validate(
         planar = world.plane(which, batch.patch.reshape(-1))[2]
         curved = ~planar & ~world.plane(which, patch)[2]
         same = (patch == batch.patch.reshape(-1)) | curved
-        on = on & (same | ~exact).reshape(c, depth)
+        rim = torch.zeros_like(exact)
+        i = torch.nonzero(exact & curved).squeeze(-1)
+        rim[i] = _on_a_rim(world, which[i], x[i], normal.reshape(-1, 3)[i])
+        on = on & ((same & ~rim) | ~exact).reshape(c, depth)
         status = torch.full((c,), int(Status.OK), device=x.device)
         if facets is not None:
             resolved = torch.ones_like(exact)
@@ -298,6 +303,21 @@ def _validate(
         status[~on.all(1)] = int(Status.OFF_SURFACE)
         status[~(length > 0).all(1) | ~finite] = int(Status.DEGENERATE)
         return status
+
+
+def _on_a_rim(world: World, which: Tensor, x: Tensor, normal: Tensor) -> Tensor:
+    """True where a curved surface ends: a step along its tangent leaves it at once.
+
+    Newton may come to rest on the sharp rim of a cylinder, as if on a very thin round; that is an
+    edge's business, not a mirror's.
+    """
+    step = RIM * world.size[which][:, None]
+    rim = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+    for tangent in transverse(unit(normal)).unbind(1):
+        for sign in (1.0, -1.0):
+            away = world.sdf(which, x + sign * step * tangent).abs()
+            rim |= away > 0.1 * step[:, 0]
+    return rim
 
 
 def _duplicates(batch: Batch, vertices: Tensor, radius: Tensor, status: Tensor) -> Tensor:
