@@ -75,7 +75,8 @@ def seconds(work: Callable[[], object], runs: int, warm: bool = True) -> Spread:
 
 def ratio(one: Callable[[], object], other: Callable[[], object], runs: int) -> list[Spread]:
     """[time of one, time of other, other / one], taking turns."""
-    one(), other()
+    one()
+    other()
     turns = [(_once(one), _once(other)) for _ in range(runs)]
     first, second = zip(*turns, strict=True)
     return [Spread(first), Spread(second), Spread(tuple(b / a for a, b in turns))]
@@ -299,8 +300,8 @@ def main() -> None:
     head = [
         "# Performance",
         "",
-        "Written by `make bench` (`benchmarks/speed.py`) on one machine, not alone on it; another will",
-        "differ. Compare a change with the same machine's figures before it.",
+        "Written by `make bench` (`benchmarks/speed.py`) on one machine; another will differ. Other work",
+        "on it shows in the spread. Compare a change with the same machine's figures before it.",
         "",
     ]
     tail = [f"Peak memory of the whole run: {peak_memory():.0f} MiB.", ""]
