@@ -20,9 +20,19 @@ from rfsg.scene.scene import Scene
 
 
 class World:
-    """A scene laid out as tensors: poses stacked, bodies listed once. ``which`` indexes nodes."""
+    """A scene laid out as tensors: poses stacked, bodies listed once. ``which`` indexes nodes.
 
-    def __init__(self, scene: Scene, device: torch.device | str = "cpu"):
+    samples, integral: how crossings of learned surfaces are integrated; None leaves it to each.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        device: torch.device | str = "cpu",
+        *,
+        samples: int | None = None,
+        integral: str = "telescoped",
+    ):
         self.scene = scene
         self.device = torch.device(device)
         nodes = scene.nodes
@@ -35,9 +45,8 @@ class World:
         self.shapes, self.shape_of_node = _distinct(
             [_shape_key(n.body) for n in nodes], self.device
         )
-        self.surfaces, self.surface_of_node = _distinct(
-            [_surface_key(n.body) for n in nodes], self.device
-        )
+        bodies, self.surface_of_node = _distinct([_surface_key(n.body) for n in nodes], self.device)
+        self.surfaces = [_with_numerics(b, samples, integral) for b in bodies]
         boxes = [n.body.shape for n in nodes if isinstance(n.body.shape, Box)]
         self.half_size = _stack([b.half_size for b in boxes], (3,), self.device)
         is_box = torch.tensor([isinstance(n.body.shape, Box) for n in nodes], device=self.device)
@@ -296,6 +305,13 @@ def _distinct(
             things.append(thing)
         owner.append(index[key])
     return things, torch.tensor(owner, dtype=torch.int64, device=device)
+
+
+def _with_numerics(body: Body, samples: int | None, integral: str) -> Body:
+    refined = getattr(body.surface, "with_numerics", None)
+    if refined is None or samples is None:
+        return body
+    return Body(body.shape, refined(samples, integral))
 
 
 def _shape_key(body: Body) -> tuple[object, Shape | None]:

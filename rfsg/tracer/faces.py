@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 from rfsg.objects.body import Body
@@ -185,11 +185,11 @@ def nearest_facets(
     )
 
 
-_FACETS: dict[tuple[int, float], tuple[object, tuple[cKDTree, Facets]]] = {}
+_FACETS: dict[tuple[int, float], tuple[object, tuple[KDTree, Facets]]] = {}
 LOOK = 1.0  # [m] reduced distance d1 d2 / (d1 + d2) of the path that samples are measured for
 
 
-def _measured(shape: Shape, device: torch.device, wavelength: float) -> tuple[cKDTree, Facets]:
+def _measured(shape: Shape, device: torch.device, wavelength: float) -> tuple[KDTree, Facets]:
     """Facets of a shape's samples in its own frame, kept like the samples themselves."""
     key = (id(shape), round(wavelength, 9))
     state = _state(shape)
@@ -203,7 +203,7 @@ def _measured(shape: Shape, device: torch.device, wavelength: float) -> tuple[cK
         half = torch.full_like(curvature, 2.0 * LOOK)
         radius = zone_radius(half, half, torch.ones_like(half), curvature, wavelength)
         facets = measure(world, which, point, normal, radius, wavelength, 2, torch.float32)
-        kept = (state, (cKDTree(point.cpu().numpy()), facets))
+        kept = (state, (KDTree(point.cpu().numpy()), facets))
         _FACETS[key] = kept
     return kept[1]
 
@@ -219,7 +219,7 @@ def _neighbourhood(point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     if len(point) <= NEIGHBOURS:
         far = torch.full_like(point[:, 0], torch.inf)
         return far, torch.zeros_like(far)
-    distance, index = cKDTree(point.cpu().numpy()).query(point.cpu().numpy(), k=NEIGHBOURS + 1)
+    distance, index = KDTree(point.cpu().numpy()).query(point.cpu().numpy(), k=NEIGHBOURS + 1)
     away = torch.from_numpy(distance[:, 1:]).to(point)
     turn = (normal[torch.from_numpy(index[:, 1:]).to(point.device)] - normal[:, None]).norm(dim=-1)
     # a neighbour round a sharp edge is on another face and says nothing of how this one bends

@@ -62,7 +62,7 @@ def kkt(vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"]) -
             matrix[:, a, b] = -across[:, i + 1]
             matrix[:, b, a] = -across[:, i + 1]
     bend = u[:, :-1] - u[:, 1:] + lam[..., None] * jet.gradient
-    return Kkt(matrix, torch.cat([bend.reshape(c, -1), jet.value], 1))
+    return Kkt(matrix, torch.cat([bend.reshape(c, 3 * depth), jet.value], 1))
 
 
 def solve_regular(

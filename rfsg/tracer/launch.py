@@ -87,14 +87,14 @@ def search(
     if depth and quality.search != "rays" and (quality.curved < 2 or quality.search == "enumerate"):
         try:
             parts.append(enumerate_chains(world, tx_position, rx_position, quality))
-            report.complete = True
+            report.complete = quality.curved < 2
         except TooMany:
             if quality.search == "enumerate":
                 raise ValueError(
                     "search='enumerate': the scene has too many sequences of faces at "
                     f"depth {depth}; lower the depth or search by rays"
                 ) from None
-    for t in range(len(tx_position) if depth and not report.complete else 0):
+    for t in range(len(tx_position) if depth and len(parts) == 1 else 0):
         found: list[Chains] = []
         tubes = first_tubes(tx_position[t], quality)
         report.rays += len(tubes)

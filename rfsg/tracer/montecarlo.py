@@ -38,7 +38,7 @@ from rfsg.tracer.launch import (
 from rfsg.tracer.march import crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Crossings, Rays
-from rfsg.tracer.simulate import positions, resolve_frequency
+from rfsg.tracer.simulate import positions, resolve_frequency, world_for
 
 COPIES = 8  # turned copies of the lattice; eight give the standard error to about a quarter
 
@@ -190,7 +190,7 @@ def estimate_power(
     """
     quality = Quality.named(quality) if isinstance(quality, str) else quality
     f = resolve_frequency(scene, frequency)[:1].to(device)
-    world = World(scene, device)
+    world = world_for(scene, quality, device)
     proxies = Proxies(world)
     tx, rx = (positions(x, device) for x in (scene.transmitters, scene.receivers))
     per_copy = torch.zeros(COPIES, len(tx), len(rx), dtype=torch.float64, device=device)

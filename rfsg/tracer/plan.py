@@ -33,7 +33,7 @@ class Quality:
     rays: int = 20_000
     floor_db: float = -80.0
     epsilon: float = 0.01
-    crossing_samples: int = 32
+    crossing_samples: int = 16
     integral: str = "telescoped"
     zone_rings: int = 2
     refits: int = 16
@@ -59,7 +59,13 @@ class Quality:
 
 PRESETS = {
     "draft": Quality(
-        depth=2, rays=5_000, floor_db=-60.0, crossing_samples=16, zone_rings=2, map_rays=20_000
+        depth=2,
+        curved_depth=1,
+        rays=5_000,
+        floor_db=-60.0,
+        crossing_samples=8,
+        refits=10,
+        map_rays=20_000,
     ),
     "standard": Quality(),
     "reference": Quality(
@@ -104,7 +110,9 @@ def make_plan(world: World, quality: Quality) -> Plan:
     if any(r.polarization != "none" for r in radios):
         modelled.append("polarisation: complex field vectors along each path")
     else:
-        left_out.append("polarisation: no radio is polarised; TE and TM are averaged")
+        left_out.append(
+            "polarisation: no radio is polarised; links carry the mean power of TE and TM"
+        )
     if any(bool(r.velocity.any()) for r in radios) or bool(world.velocity.any()):
         modelled.append("Doppler of moving radios and objects")
     else:

@@ -21,7 +21,7 @@ from rfsg.tracer.embree import Proxies
 from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.montecarlo import COPIES, Flight, flights
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.simulate import positions, resolve_frequency, simulate
+from rfsg.tracer.simulate import positions, resolve_frequency, simulate, world_for
 
 SUB = 4  # sub-cells per side, from which the spread within a cell is read
 MOST_CELLS = (
@@ -78,7 +78,7 @@ def radio_map(
         raise SceneError([f"map method {method!r}: expected 'rays' or 'paths'"])
     quality = Quality.named(quality) if isinstance(quality, str) else quality
     f = resolve_frequency(scene, frequency)[:1].to(device)
-    world = World(scene, device)
+    world = world_for(scene, quality, device)
     x0, y0, x1, y1 = bounds or _extent(world)
     nx, ny = (max(1, math.ceil(s / cell - 1e-9)) for s in (x1 - x0, y1 - y0))
     if not (cell > 0 and x1 > x0 and y1 > y0) or nx * ny > MOST_CELLS:

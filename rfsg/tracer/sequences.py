@@ -20,9 +20,7 @@ from rfsg.tracer.faces import Planes, Samples, planes_of, samples_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains
 
-MOST_PAIRS = (
-    30_000_000  # beam tests and image solves that an enumeration may take (a minute of work)
-)
+MOST_PAIRS = 300_000_000  # beam tests and image solves an enumeration may take: a minute or two
 NEAR = 3.0  # times the samples' spacing: how far a glint may lie from its nearest sample
 EDGE = 1e-9  # of a face's extent: a path through a face's very edge belongs to it
 

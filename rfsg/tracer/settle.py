@@ -26,7 +26,10 @@ SETTLED = 1e-9  # [m] a vertex moves less than this between rounds: phase to 1e-
 EDGE_SLACK = 0.03  # [m] how far beyond a planar face's edge a vertex under way may be
 NEARLY = 2e-6  # [m] where float32's own rounding begins: float64 takes over
 PATIENCE = 5  # rounds after which a vertex must keep shrinking its steps, from
-RESTLESS, SHRINKING = 0.05, 0.7  # of its zone's radius: else it cycles between two views of a rough face
+RESTLESS, SHRINKING = (
+    0.05,
+    0.7,
+)  # of its zone's radius: else it cycles between two views of a rough face
 SAME = 1e-3  # [m] chains of one sequence this close after two rounds are on their way to one path
 
 

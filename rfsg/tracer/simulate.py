@@ -77,7 +77,7 @@ def simulate(
     tell = progress or (lambda _: None)
     with torch.set_grad_enabled(gradients):
         with _timed(seconds, "plan", tell):
-            world = World(scene, device)
+            world = world_for(scene, quality, device)
             plan = make_plan(world, quality)
         with _timed(seconds, "proxies", tell):
             proxies = Proxies(world)
@@ -97,6 +97,12 @@ def simulate(
     return Result(
         scene, frequencies, paths, channel, chains, plan, report, named, seconds, scene.warnings
     )
+
+
+def world_for(scene: Scene, quality: Quality, device: torch.device | str) -> World:
+    """The scene as tensors, its crossings integrated as the quality says."""
+    samples, integral = quality.crossing_samples, quality.integral
+    return World(scene, device, samples=samples, integral=integral)
 
 
 @contextmanager

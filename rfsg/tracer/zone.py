@@ -21,7 +21,6 @@ from torch import Tensor
 
 from rfsg.objects.contract import Jet
 from rfsg.scene.world import World, unit
-from rfsg.tracer.implicit import transverse
 
 RELIEF = 1.0 / 16.0  # of a wavelength: what a mirror may depart from its quadric (Rayleigh's half)
 ALIGNED = (0.64, 0.87)  # cosines of 50 and 30 degrees: below the first a sample is another face
@@ -103,7 +102,7 @@ def measure(
     object's own frame, so moving the whole scene moves the answer and changes nothing else.
     """
     normal_object = world.direction_object(which, normal)
-    rows = transverse(normal_object)
+    rows = _tangents(normal_object)
     frame_object = torch.cat([rows, normal_object[:, None]], 1)
     frame = torch.stack([world.direction_world(which, frame_object[:, k]) for k in range(3)], 1)
     whole = _fit(world, which, centre, frame, radius, rings, dtype)
@@ -120,6 +119,20 @@ def measure(
         whole = _added(whole, i, smaller, share)
         left = left.index_copy(0, i, left[i] - share)
     return whole
+
+
+def _tangents(normal: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2 3"]:
+    """Two tangents as rows that turn as little as the normal does.
+
+    Not about the least component of the normal: on a flat face two components are ripple, and the
+    pattern of samples would turn by a right angle from one round to the next.
+    """
+    steep = normal[:, 2].abs() > 0.9
+    axis = torch.zeros_like(normal)
+    axis[:, 2] = (~steep).to(normal.dtype)
+    axis[:, 0] = steep.to(normal.dtype)
+    first = unit(torch.linalg.cross(axis, normal))
+    return torch.stack([first, torch.linalg.cross(normal, first)], 1)
 
 
 def _trust(facets: Facets, wavelength: float) -> Float[Tensor, "m"]:

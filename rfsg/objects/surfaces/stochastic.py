@@ -6,6 +6,7 @@ step; phi in [-pi/2, pi/2] and Re a >= 0, so nothing amplifies; every boundary c
 sqrt(1 - |R|^2) ("conserving"), unless the paper's literal form is asked for ("paper").
 """
 
+import copy
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -118,6 +119,17 @@ class StochasticSurface(nn.Module):
     def interaction_length(self) -> Float[Tensor, ""]:
         """Length over which a reflection interacts with the object [m]."""
         return self.log_interaction_length.exp()
+
+    def with_numerics(self, samples: int, integral: str) -> "StochasticSurface":
+        """The same surface (parameters shared) integrated with so many intervals, by that rule.
+
+        How finely a crossing is integrated is the asker's business, not the material's.
+        """
+        _require(integral in transport.INTEGRALS, "integral", integral, "telescoped or riemann")
+        _require(samples >= 1, "samples", samples, "a number of intervals >= 1")
+        other = copy.copy(self)
+        other.samples, other.integral = samples, integral
+        return other
 
     def config(self) -> dict:
         """Constructor arguments, JSON-able, without the weights."""
