@@ -109,7 +109,9 @@ def test_moving_the_cabinet_changes_exactly_what_it_should(lab, result):
     changed = 0
     for here, there, other in ((before, after, moved), (after, before, result)):
         for key in here.keys() - there.keys():
-            if not here[key][1]:  # it does not touch the cabinet here, so over there it must be in the way
+            if not here[key][
+                1
+            ]:  # it does not touch the cabinet here, so over there it must be in the way
                 assert _in_the_way(other, index, here[key][2])
             changed += 1
     assert changed > 5

@@ -53,7 +53,8 @@ class State:
     status: Tensor
     charts: Charts
     curvature: Float[Tensor, "c d"]
-    before: Float[Tensor, "c d 3"]  # the change of the round before, for Aitken's step
+    before: Float[Tensor, "c d 3"]  # the change of the round before, and where it led
+    moved: Float[Tensor, "c d 3"]
 
 
 def settle(
@@ -74,7 +75,9 @@ def _start(world: World, batch: Batch) -> State:
     flat = torch.zeros(c, depth, dtype=torch.float64, device=world.device)
     status = torch.full((c,), int(Status.NOT_CONVERGED), device=world.device)
     charts = Charts(batch.x.clone(), normal, flat)
-    return State(batch.x.clone(), status, charts, flat.clone(), torch.zeros_like(batch.x))
+    return State(
+        batch.x.clone(), status, charts, flat.clone(), torch.zeros_like(batch.x), batch.x.clone()
+    )
 
 
 def _rounds(
@@ -141,8 +144,9 @@ def _round(
         state.status[rows[twin]] = int(Status.DUPLICATE)
         go = go & ~twin
     leap = (go & (number > 1))[:, None, None]
-    state.x[rows] = torch.where(leap, part.x + _extrapolated(change, state.before[rows]), moved)
-    state.before[rows] = change
+    mixed = _mixed(moved, change, state.moved[rows], state.before[rows])
+    state.x[rows] = torch.where(leap, mixed, moved)
+    state.before[rows], state.moved[rows] = change, moved
     bend = torch.zeros_like(radius).reshape(-1)
     bend[learned.reshape(-1)] = facets.curvature()
     state.curvature[rows] = bend.reshape(radius.shape)
@@ -164,13 +168,16 @@ def _twins(part: Batch, moved: Tensor) -> Tensor:
     return twin
 
 
-def _extrapolated(change: Tensor, before: Tensor) -> Tensor:
-    """Aitken's step: rounds that shrink by a steady factor are summed to their end at once."""
-    now, last = change.flatten(1), before.flatten(1)
-    square = (last * last).sum(1)
-    factor = (now * last).sum(1) / torch.where(square == 0, torch.ones_like(square), square)
-    factor = torch.where(square == 0, torch.zeros_like(factor), factor.clamp(-0.9, 0.8))
-    return change / (1.0 - factor)[:, None, None]
+def _mixed(moved: Tensor, change: Tensor, moved_before: Tensor, before: Tensor) -> Tensor:
+    """Anderson's step of depth one: the mix of the last two rounds whose changes cancel best.
+
+    Rounds shrink, or swing to and fro, by a steady factor; the mix goes to where they would end.
+    """
+    now, turn = change.flatten(1), (change - before).flatten(1)
+    square = (turn * turn).sum(1)
+    share = (now * turn).sum(1) / torch.where(square == 0, torch.ones_like(square), square)
+    share = torch.where(square == 0, torch.zeros_like(share), share.clamp(-5.0, 0.95))
+    return moved - share[:, None, None] * (moved - moved_before)
 
 
 def _measure(

@@ -29,6 +29,7 @@ HELD = (
     0.2,
     0.45,
 )  # share of a full zone's weight on the face: below the first a zone is not believed
+SHEET = 0.25  # wavelengths: what lies further off the tangent plane within a zone is another sheet
 LEAST_WEIGHT = 0.3  # between the two: less of a face than this is not a mirror
 
 
@@ -105,14 +106,16 @@ def measure(
     rows = _tangents(normal_object)
     frame_object = torch.cat([rows, normal_object[:, None]], 1)
     frame = torch.stack([world.direction_world(which, frame_object[:, k]) for k in range(3)], 1)
-    whole = _fit(world, which, centre, frame, radius, rings, dtype)
+    whole = _fit(world, which, centre, frame, radius, wavelength, rings, dtype)
     left = 1.0 - _trust(whole, wavelength)  # what smaller zones still have to say
     whole = _scaled(whole, 1.0 - left)
     for k, shrink in enumerate(SHRINKS[1:], 2):
         i = torch.nonzero(left > 0).squeeze(-1)
         if not len(i):
             break
-        smaller = _fit(world, which[i], centre[i], frame[i], shrink * radius[i], rings, dtype)
+        smaller = _fit(
+            world, which[i], centre[i], frame[i], shrink * radius[i], wavelength, rings, dtype
+        )
         # the smallest takes what is left, trusted or not: ``resolved`` has the last word
         trust = _trust(smaller, wavelength)
         share = left[i] * (trust if k < len(SHRINKS) else torch.ones_like(trust))
@@ -176,6 +179,7 @@ def _fit(
     centre: Tensor,
     frame: Tensor,
     radius: Tensor,
+    wavelength: float,
     rings: int,
     dtype: torch.dtype,
 ) -> Facets:
@@ -190,7 +194,7 @@ def _fit(
     taper = torch.exp(-2.0 * (uv * uv).sum(-1))
     weight = taper * _smoothstep(aligned, *ALIGNED)
     weight = weight * torch.exp(-((missed / (0.02 * radius[:, None])) ** 2))
-    weight = weight * torch.exp(-((height / radius[:, None]) ** 4))
+    weight = weight * torch.exp(-((height / (SHEET * wavelength)) ** 4))
     return _least_squares(centre, frame, radius, uv, height, weight, taper.sum())
 
 
