@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from tests.scenes import radio, room_nodes
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Box
@@ -19,6 +18,7 @@ from rfsg.tracer.channel import coefficients
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
+from tests.scenes import radio, room_nodes
 
 ASSETS = Path(__file__).resolve().parents[1] / "assets"
 QUALITY = Quality(depth=2)

@@ -6,6 +6,7 @@ from all around for the second.
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
@@ -219,7 +220,8 @@ def _neighbourhood(point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     if len(point) <= NEIGHBOURS:
         far = torch.full_like(point[:, 0], torch.inf)
         return far, torch.zeros_like(far)
-    distance, index = KDTree(point.cpu().numpy()).query(point.cpu().numpy(), k=NEIGHBOURS + 1)
+    found = KDTree(point.cpu().numpy()).query(point.cpu().numpy(), k=NEIGHBOURS + 1)
+    distance, index = (np.asarray(x) for x in found)
     away = torch.from_numpy(distance[:, 1:]).to(point)
     turn = (normal[torch.from_numpy(index[:, 1:]).to(point.device)] - normal[:, None]).norm(dim=-1)
     # a neighbour round a sharp edge is on another face and says nothing of how this one bends
