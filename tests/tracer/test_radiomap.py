@@ -2,12 +2,12 @@
 
 import pytest
 import torch
-from tests.scenes import room
 
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.tracer.montecarlo import estimate_power
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.radiomap import radio_map
+from tests.scenes import room
 
 QUALITY = Quality(depth=1, map_rays=120_000, floor_db=-100.0)
 BOUNDS = (0.0, 0.0, 6.0, 4.0)

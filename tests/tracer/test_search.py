@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.laws.test_simulation_laws import furnished
-from tests.scenes import radio, room, vector
 
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.tracer.launch import fibonacci
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
+from tests.laws.test_simulation_laws import furnished
+from tests.scenes import radio, room, vector
 
 QUALITY = Quality(depth=2, rays=8000, floor_db=-100.0)
 
