@@ -138,3 +138,32 @@ def _in_the_way(result, index, vertices):
     keep = length > 0
     rays = Rays(vertices[:-1][keep], delta[keep] / length[keep, None], length[keep])
     return len(Proxies(world).spans(rays).ray) > 0
+
+
+def test_gradients_reach_the_weights_of_a_learned_shape():
+    """Length and power of a path that a neural face reflects, by its offset: autograd against
+    central differences (a float32 weight, so the difference is exact and the rest float64)."""
+    shape = load_asset(ASSETS / "objects" / "cabinet" / "cabinet.usda").body.shape
+    node = Node("/c", Body(shape, Conductor()), Pose.at(1.2, 1.9, 0.005, 10.0))
+    tx, rx = radio("/t", 3.6, 3.1, 1.3), radio("/r", 4.1, 1.1, 0.65)
+    scene = Scene((node,), (tx,), (rx,), 2.44e9)
+    quality = Quality(depth=1)
+    chains = simulate(scene, quality=quality).chains
+    offset = shape.to_value.bias.requires_grad_(True)
+
+    def run(gradients: bool):
+        result = simulate(scene, quality=quality, gradients=gradients, chains=chains)
+        bounced = int(torch.nonzero((result.paths.which >= 0).any(1))[0])
+        return torch.stack([result.paths.length[bounced], result.path_gain().sum() * 1e6])
+
+    found = [torch.autograd.grad(y, offset, retain_graph=True)[0].item() for y in run(True)]
+    h = 2.0**-12
+    with torch.no_grad():
+        offset += h
+        above = run(False)
+        offset -= 2 * h
+        below = run(False)
+        offset += h
+    expected = ((above - below) / (2 * h)).tolist()
+    assert abs(found[0]) > 0.1
+    assert found == pytest.approx(expected, rel=1e-3)
