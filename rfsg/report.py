@@ -89,7 +89,7 @@ def write_paths(result: Any, file: Path) -> None:
 
     ``phase_rad`` is that of gain * exp(-j 2 pi f delay), in (-pi, pi]. Angles are in the world:
     departure along the travel from the transmitter, arrival from the receiver back to the wave.
-    ``interactions`` lists reflections in order, then penetrations. ``vertices`` is "x y z; x y z".
+    ``interactions`` lists reflections and penetrations in order along the path. ``vertices`` is "x y z; x y z".
     """
     _write_table(file, PATH_COLUMNS, path_rows(result))
 
@@ -147,7 +147,7 @@ def write_channel(result: Any, file: Path) -> None:
     """channel.npz: the whole channel and its paths as arrays; ``np.load`` needs no pickle.
 
     gain [p, f] complex, delay [p] s, frequency [f] Hz, doppler [p] Hz, departure and arrival
-    [p, 3], tx and rx [p] into tx_paths and rx_paths, which [p, d] and crossed [x, 2] into
+    [p, 3], tx and rx [p] into tx_paths and rx_paths, which [p, d] and crossed [x, 3] into
     node_paths (-1 pads), vertices [p, d+2, 3] m, status [p], path_gain [tx, rx, f] linear.
     """
     scene, channel, paths = result.scene, result.channel, result.paths
@@ -264,16 +264,20 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value).replace(" ", "")
 
 
-def _interactions(scene: "Scene", reflected: list[int], crossed: list[int]) -> str:
-    words = [f"reflection({scene.nodes[i].path})" for i in reflected]
-    words += [f"penetration({scene.nodes[i].path})" for i in crossed]
+def _interactions(scene: "Scene", reflected: list[int], crossed: list[tuple[int, int]]) -> str:
+    """Reflections on nodes, and penetrations as (segment, node), in order along the path."""
+    words = []
+    for segment in range(len(reflected) + 1):
+        words += [f"penetration({scene.nodes[i].path})" for s, i in crossed if s == segment]
+        if segment < len(reflected):
+            words.append(f"reflection({scene.nodes[reflected[segment]].path})")
     return " ".join(words) or "line_of_sight"
 
 
-def _crossed_by_path(channel: Any) -> dict[int, list[int]]:
-    through: dict[int, list[int]] = {}
-    for path, node in _numpy(channel.crossed).tolist():
-        through.setdefault(path, []).append(node)
+def _crossed_by_path(channel: Any) -> dict[int, list[tuple[int, int]]]:
+    through: dict[int, list[tuple[int, int]]] = {}
+    for path, node, segment in _numpy(channel.crossed).tolist():
+        through.setdefault(path, []).append((segment, node))
     return through
 
 

@@ -115,7 +115,7 @@ def small_run():
         doppler=real([0.0, 1.5, 0.0, 0.0]),
         departure=towards / towards.norm(dim=-1, keepdim=True),
         arrival=back / back.norm(dim=-1, keepdim=True),
-        crossed=torch.tensor([[2, 1], [3, 1]]),
+        crossed=torch.tensor([[2, 1, 0], [3, 1, 0]]),
         blocked=torch.tensor([False, False, False, True]),
     )
     links = [

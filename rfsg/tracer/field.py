@@ -190,7 +190,7 @@ def channel(
         _doppler(world, paths, u, transmitters, receivers, frequency[0]),
         departure,
         arrival,
-        torch.stack([through.path, through.which], -1),
+        torch.stack([through.path, through.which, through.segment], -1),
         blocked,
     )
 

@@ -106,7 +106,7 @@ class Channel:
     """h(f) = sum_l gain_l(f) exp(-j 2 pi f delay_l) between the given antennas, 1 W in.
 
     ``gain`` leaves out the propagation phase of ``delay``; path gain is |gain|^2. ``crossed`` lists
-    (path, node) pairs of objects that a path goes through.
+    (path, node, segment) of objects that a path goes through, in order along each path.
     """
 
     tx: Int[Tensor, "p"]
@@ -117,5 +117,5 @@ class Channel:
     doppler: Float[Tensor, "p"]  # [Hz] at frequency[0]
     departure: Float[Tensor, "p 3"]  # unit vector, world, leaving the transmitter
     arrival: Float[Tensor, "p 3"]  # unit vector, world, from the receiver back towards the wave
-    crossed: Int[Tensor, "x 2"]
+    crossed: Int[Tensor, "x 3"]
     blocked: Bool[Tensor, "p"]

@@ -165,7 +165,7 @@ def _above_floor(
     number = torch.full((len(drop),), -1, dtype=torch.int64, device=drop.device)
     number[keep] = torch.arange(len(keep), device=drop.device)
     crossed = channel.crossed[~drop[channel.crossed[:, 0]]]
-    crossed = torch.stack([number[crossed[:, 0]], crossed[:, 1]], -1)
+    crossed = torch.cat([number[crossed[:, :1]], crossed[:, 1:]], -1)
     paths = replace(paths, **{n: getattr(paths, n)[keep] for n in Paths.__dataclass_fields__})
     per_path = [n for n in Channel.__dataclass_fields__ if n not in ("frequency", "crossed")]
     kept = {n: getattr(channel, n)[keep] for n in per_path}
