@@ -36,6 +36,12 @@ class SearchReport:
     complete: bool = False  # every sequence of faces was looked at: nothing can be missing
     per_depth: list[int] = field(default_factory=list)
 
+    def sentence(self) -> str:
+        """How the paths were looked for, for the report."""
+        if self.complete:
+            return f"search: every sequence of faces, {self.candidates} candidate paths in all"
+        return f"search: {self.rays} rays launched, {self.candidates} candidate paths in all"
+
 
 @dataclass
 class Tubes:

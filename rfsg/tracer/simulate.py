@@ -85,6 +85,7 @@ def simulate(
             report = SearchReport()
             if chains is None:
                 chains, report = search(world, proxies, tx, rx, frequencies, quality)
+                plan = replace(plan, modelled=(*plan.modelled, report.sentence()))
         with _timed(seconds, "solve", tell):
             wavelength = SPEED_OF_LIGHT / float(frequencies[0])
             paths, counts = solve(world, chains, tx, rx, wavelength, quality)
