@@ -23,7 +23,7 @@ from rfsg.scene.antennas import PATTERNS
 from rfsg.scene.radios import Radio
 from rfsg.scene.world import World, unit
 from rfsg.tracer.embree import Proxies
-from rfsg.tracer.implicit import segments
+from rfsg.tracer.implicit import segments, transverse
 from rfsg.tracer.march import EVALUATE, crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Channel, Crossings, Paths, Rays
@@ -318,8 +318,7 @@ def _act(
     """
     e = torch.linalg.cross(incoming, normal)
     straight = (e * e).sum(-1, keepdim=True) < 1e-20
-    helper = torch.zeros_like(incoming).scatter(1, incoming.abs().argmin(1, keepdim=True), 1.0)
-    e = unit(torch.where(straight, torch.linalg.cross(incoming, helper), e))
+    e = unit(torch.where(straight, transverse(incoming)[:, 0], e))
     p_in = torch.linalg.cross(e, incoming)
     reflected = ((outgoing - incoming) ** 2).sum(-1, keepdim=True) > 1e-20
     mirrored = p_in - 2.0 * (p_in * normal).sum(-1, keepdim=True) * normal
