@@ -101,18 +101,14 @@ def search(
                     f"depth {depth}; lower the depth or search by rays"
                 ) from None
     for t in range(len(tx_position) if depth and len(parts) == 1 else 0):
-        found: list[Chains] = []
         tubes = first_tubes(tx_position[t], quality)
         report.rays += len(tubes)
-        for level in range(depth):
+        for _ in range(depth):
             tubes = _bounce(world, proxies, tubes, frequency, quality, report)
             report.per_depth.append(len(tubes))
             if not len(tubes):
                 break
-            found.append(_receive(tubes, t, rx_position, depth, quality, report))
-            if level + 1 == depth:
-                break
-        parts.extend(found)
+            parts.append(_receive(tubes, t, rx_position, depth, quality, report))
     chains = Chains(
         *(torch.cat([getattr(p, n) for p in parts]) for n in Chains.__dataclass_fields__)
     )

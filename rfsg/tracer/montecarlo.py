@@ -137,7 +137,7 @@ def _fly(
     else:
         drawn, toll, gain = front, -torch.log(t.clamp(min=1e-300)), r
     toll = torch.where(t <= 0, torch.inf, toll)
-    before = ended_before(inside, torch.where(torch.isfinite(toll), toll, torch.inf))
+    before = ended_before(inside, toll)
     arriving = weight[inside.ray] * torch.exp(-before)
     end = rays.limit.clone()
     if branching == "draw":

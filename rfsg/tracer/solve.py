@@ -102,7 +102,7 @@ def _solve_depth(world: World, batch: Batch, wavelength: float, quality: Quality
     if bool(mirrors.all()):
         return _images(world, batch)
     curved = ~mirrors
-    result = _merge(
+    return _merge(
         c,
         [
             (torch.nonzero(mirrors).squeeze(-1), lambda b: _images(world, b)),
@@ -113,7 +113,6 @@ def _solve_depth(world: World, batch: Batch, wavelength: float, quality: Quality
         ],
         batch,
     )
-    return result
 
 
 def _merge(c: int, jobs: list[tuple[Tensor, Callable[[Batch], Solved]]], batch: Batch) -> Solved:
