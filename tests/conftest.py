@@ -99,10 +99,13 @@ def small_run():
         tx=torch.zeros(4, dtype=torch.int64),
         rx=torch.tensor([0, 0, 1, 1]),
         which=which,
+        act=torch.zeros_like(which),
+        item=which,
         vertices=vertices,
         normal=torch.zeros(4, 1, 3, dtype=torch.float64),
         length=length,
         spread=1 / length,
+        caustics=torch.zeros(4, dtype=torch.int64),
         status=torch.zeros(4, dtype=torch.int64),
     )
     gain = torch.polar(0.0239 / length, real([0.0, 3.0, 0.5, 0.0]))[:, None]

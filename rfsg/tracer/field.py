@@ -18,12 +18,14 @@ import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
-from rfsg.objects.contract import Contact, Crossing
+from rfsg.objects.contract import Crossing
 from rfsg.scene.antennas import PATTERNS
 from rfsg.scene.radios import Radio
 from rfsg.scene.world import World, unit
+from rfsg.tracer.acting import COEFFICIENT, DYAD, Acting, dyad_of, scalar
+from rfsg.tracer.edges import Edges
 from rfsg.tracer.embree import Proxies
-from rfsg.tracer.implicit import segments, transverse
+from rfsg.tracer.implicit import segments
 from rfsg.tracer.march import EVALUATE, crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Channel, Crossings, Paths, Rays
@@ -159,39 +161,50 @@ def channel(
     receivers: tuple[Radio, ...],
     frequency: Float[Tensor, "f"],
     quality: Quality,
+    edges: Edges | None = None,
 ) -> Channel:
-    """The channel of exact paths at all frequencies. Paths through opaque objects have gain 0."""
+    """The channel of exact paths at all frequencies. Paths through opaque objects have gain 0.
+
+    edges: those that the paths' DIFFRACT vertices number.
+    """
     wavelength = SPEED_OF_LIGHT / frequency
     through = passages(world, proxies, paths, float(wavelength.min()), quality)
     through = with_gradient(world, through)
     _, u = segments(paths.vertices)
     departure, arrival = u[:, 0], -_last(u, paths)
+    scale = wavelength[None] / (4 * torch.pi) * paths.spread[:, None]
+    excess = _excess(world, paths, through, frequency)
+    # T carries the phase of what was crossed; what moves into the delay leaves the gain. Every
+    # caustic passed advances the phase by pi/2 (exp(+j 2 pi f t); Kouyoumjian and Pathak 1974, Eq. 6)
+    phase = (
+        2.0 * torch.pi * frequency[None] * excess[:, None]
+        + 0.5 * torch.pi * paths.caustics[:, None]
+    )
+    scale = scale * torch.polar(torch.ones_like(phase), phase)
+    at = Acting(world, paths, u, frequency, edges)
+    jones = None
     if _polarised(transmitters, receivers):
-        action = _jones(world, paths, through, u, transmitters, receivers, frequency)
+        jones = _jones(at, through, transmitters, receivers) * scale[..., None, None]
+        gain = _between_ports(jones, paths, departure, arrival, transmitters, receivers)
     else:
         antennas = _patterns(transmitters, paths.tx, departure) * _patterns(
             receivers, paths.rx, arrival
         )
-        action = _scalar(world, paths, through, u, frequency) * antennas[:, None]
-    gain = action * (wavelength / (4 * torch.pi))[None] * paths.spread[:, None]
-    excess = _excess(world, through, len(paths.tx), frequency)
-    # T carries the phase of what was crossed; what moves into the delay leaves the gain
-    phase = 2.0 * torch.pi * frequency[None] * excess[:, None]
-    gain = gain * torch.polar(torch.ones_like(phase), phase)
-    delay = paths.length / SPEED_OF_LIGHT + excess
+        gain = _scalar(at, through) * antennas[:, None] * scale
     blocked = torch.zeros(len(paths.tx), dtype=torch.bool, device=world.device)
     blocked[through.path[world.opaque[through.which]]] = True
     return Channel(
         paths.tx,
         paths.rx,
         frequency,
-        delay,
+        paths.length / SPEED_OF_LIGHT + excess,
         gain,
         _doppler(world, paths, u, transmitters, receivers, frequency[0]),
         departure,
         arrival,
         torch.stack([through.path, through.which, through.segment], -1),
         blocked,
+        jones,
     )
 
 
@@ -201,48 +214,20 @@ def _last(u: Tensor, paths: Paths) -> Tensor:
     return u[torch.arange(len(u), device=u.device), last]
 
 
-def _contacts(paths: Paths, u: Tensor, level: int) -> tuple[Tensor, Tensor, Contact]:
-    """Paths that reflect at a level, on what, and how."""
-    i = torch.nonzero(paths.which[:, level] >= 0).squeeze(-1)
-    contact = Contact(
-        paths.vertices[i, level + 1], u[i, level], u[i, level + 1], paths.normal[i, level]
-    )
-    return i, paths.which[i, level], contact
-
-
-def _scalar(
-    world: World, paths: Paths, through: Passages, u: Tensor, frequency: Tensor
-) -> Complex[Tensor, "p f"]:
+def _scalar(at: Acting, through: Passages) -> Complex[Tensor, "p f"]:
     """Product of all scalar coefficients."""
-    shape = (len(paths.tx), len(frequency))
-    product = torch.ones(shape, dtype=torch.complex128, device=world.device)
-    for level in range(paths.which.shape[1]):
-        i, which, contact = _contacts(paths, u, level)
-        if len(i):
-            factor = scalar(world.reflection(which, contact, frequency))
+    shape = (len(at.paths.tx), len(at.frequency))
+    product = torch.ones(shape, dtype=torch.complex128, device=at.world.device)
+    for level in range(at.paths.which.shape[1]):
+        for i, act in at.vertices(level):
+            factor = COEFFICIENT[act](at, i, level)
             product = product * torch.ones_like(product).index_copy(0, i, factor)
     if len(through.path):
-        factor = scalar(world.transmission(through.which, through.crossing, frequency))
+        factor = scalar(at.world.transmission(through.which, through.crossing, at.frequency))
         for slot in _slots(through.path):
             i = through.path[slot]
             product = product * torch.ones_like(product).index_copy(0, i, factor[slot])
     return product
-
-
-def scalar(pair: Complex[Tensor, "*b 2"]) -> Complex[Tensor, "*b"]:
-    """One coefficient for an unpolarised link: mean power of (TE, TM), phase of TE."""
-    te, tm = pair[..., 0], pair[..., 1]
-    te_power = te.real**2 + te.imag**2
-    power = 0.5 * (te_power + tm.real**2 + tm.imag**2)
-    dark = te_power < DARK
-    ratio = torch.where(dark, torch.ones_like(power), power / torch.where(dark, 1.0, te_power))
-    # without a TE wave there is no phase to take: the TM share alone, in phase
-    alone = torch.sqrt(torch.where(dark & (power > DARK), power, torch.ones_like(power)))
-    alone = torch.where(dark & (power > DARK), alone, torch.zeros_like(alone)).to(pair.dtype)
-    return torch.where(dark, alone, torch.sqrt(ratio) * te)
-
-
-DARK = 1e-60  # power of -600 dB: nothing
 
 
 def _slots(path: Int[Tensor, "m"]) -> list[Tensor]:
@@ -263,20 +248,14 @@ def _polarised(transmitters: tuple[Radio, ...], receivers: tuple[Radio, ...]) ->
 
 
 def _jones(
-    world: World,
-    paths: Paths,
-    through: Passages,
-    u: Tensor,
-    transmitters: tuple[Radio, ...],
-    receivers: tuple[Radio, ...],
-    frequency: Tensor,
-) -> Complex[Tensor, "p f"]:
-    """Receiver's field vector . everything on the path . transmitter's field vector."""
-    departure, arrival = u[:, 0], -_last(u, paths)
-    field = _field_vectors(transmitters, paths.tx, departure)[:, None].to(torch.complex128)
-    field = field.expand(-1, len(frequency), -1)
+    at: Acting, through: Passages, transmitters: tuple[Radio, ...], receivers: tuple[Radio, ...]
+) -> Complex[Tensor, "p f 2 2"]:
+    """From (theta, phi) of the transmitter to (theta, phi) of the receiver, without spreading."""
+    paths, u = at.paths, at.u
+    sent = _basis(transmitters, paths.tx, u[:, 0])
+    field = sent.mT[:, None].to(torch.complex128).expand(-1, len(at.frequency), -1, -1)
     transmission = (
-        world.transmission(through.which, through.crossing, frequency)
+        at.world.transmission(through.which, through.crossing, at.frequency)
         if len(through.path)
         else None
     )
@@ -287,67 +266,68 @@ def _jones(
                 for slot in _slots(through.path[here]):
                     field = _through(field, through, here[slot], u[:, level], transmission)
         if level < paths.which.shape[1]:
-            i, which, contact = _contacts(paths, u, level)
-            if len(i):
-                pair = world.reflection(which, contact, frequency)
-                bent = _act(field[i], pair, contact.incoming, contact.outgoing, contact.normal)
-                field = field.index_copy(0, i, bent)
-    received = _field_vectors(receivers, paths.rx, arrival)
-    return (field * received[:, None]).sum(-1)
+            for i, act in at.vertices(level):
+                field = field.index_copy(0, i, DYAD[act](at, i, level) @ field[i])
+    received = _basis(receivers, paths.rx, -_last(u, paths))
+    return received[:, None].to(field.dtype) @ field
 
 
 def _through(
     field: Tensor, through: Passages, i: Tensor, u: Tensor, transmission: Tensor
 ) -> Tensor:
     path = through.path[i]
-    n = through.crossing.normal_start[i] - through.crossing.normal_end[i]
-    return field.index_copy(0, path, _act(field[path], transmission[i], u[path], u[path], unit(n)))
+    n = unit(through.crossing.normal_start[i] - through.crossing.normal_end[i])
+    bent = dyad_of(transmission[i], u[path], u[path], n) @ field[path]
+    return field.index_copy(0, path, bent)
 
 
-def _act(
-    field: Complex[Tensor, "m f 3"],
-    pair: Complex[Tensor, "m f 2"],
-    incoming: Float[Tensor, "m 3"],
-    outgoing: Float[Tensor, "m 3"],
-    normal: Float[Tensor, "m 3"],
-) -> Complex[Tensor, "m f 3"]:
-    """E_out = R_te e (e . E) + R_tm p_out (p_in . E), e across the plane of incidence.
-
-    p_in = e x k_in, and p_out is its mirror image: at normal incidence the two coefficients then
-    do the same, as the contract says.
-    """
-    e = torch.linalg.cross(incoming, normal)
-    straight = (e * e).sum(-1, keepdim=True) < 1e-20
-    e = unit(torch.where(straight, transverse(incoming)[:, 0], e))
-    p_in = torch.linalg.cross(e, incoming)
-    reflected = ((outgoing - incoming) ** 2).sum(-1, keepdim=True) > 1e-20
-    mirrored = p_in - 2.0 * (p_in * normal).sum(-1, keepdim=True) * normal
-    p_out = torch.where(reflected, mirrored, p_in)
-    te = (field * e[:, None]).sum(-1, keepdim=True) * pair[..., :1]
-    tm = (field * p_in[:, None]).sum(-1, keepdim=True) * pair[..., 1:]
-    return te * e[:, None] + tm * p_out[:, None]
-
-
-def _field_vectors(
+def _basis(
     radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
-) -> Float[Tensor, "p 3"]:
-    """Pattern amplitude times the unit field vector of each radio's polarisation, in the world.
+) -> Float[Tensor, "p 2 3"]:
+    """Rows theta-hat and phi-hat, in the world, of each path's radio along a direction.
 
-    "V" is theta-hat and "H" phi-hat of the radio's own frame (3GPP TR 38.901 section 7.1);
+    Of the radio's own frame (3GPP TR 38.901 section 7.1); on its z axis phi-hat is taken as +y.
+    """
+    if not radios:
+        return direction.new_zeros(0, 2, 3)
+    rotation = torch.stack([r.rotation.to(direction) for r in radios])[index]
+    local = torch.einsum("pij,pi->pj", rotation, direction)
+    flat = torch.stack([-local[:, 1], local[:, 0], torch.zeros_like(local[:, 0])], -1)
+    pole = (flat * flat).sum(-1, keepdim=True) < 1e-24
+    y_axis = torch.tensor([0.0, 1.0, 0.0], dtype=flat.dtype, device=flat.device)
+    phi = unit(torch.where(pole, y_axis, flat))
+    both = torch.stack([torch.linalg.cross(phi, local), phi], 1)
+    return both @ rotation.mT
+
+
+def _between_ports(
+    jones: Complex[Tensor, "p f 2 2"],
+    paths: Paths,
+    departure: Float[Tensor, "p 3"],
+    arrival: Float[Tensor, "p 3"],
+    transmitters: tuple[Radio, ...],
+    receivers: tuple[Radio, ...],
+) -> Complex[Tensor, "p f"]:
+    """Gain between the reference ports, the first of each radio."""
+    sent = _components(transmitters, paths.tx, departure)
+    heard = _components(receivers, paths.rx, arrival)
+    return torch.einsum("pa,pfab,pb->pf", heard, jones, sent)
+
+
+def _components(
+    radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
+) -> Complex[Tensor, "p 2"]:
+    """(theta, phi) components of each path's radio along a world direction, pattern included.
+
     "none" beside a polarised radio is taken as V.
     """
-    out = torch.zeros_like(direction)
+    out = torch.zeros(len(index), 2, dtype=torch.complex128, device=direction.device)
     for r in torch.unique(index).tolist():
         i = torch.nonzero(index == r).squeeze(-1)
-        rotation = radios[r].rotation.to(direction)
-        local = direction[i] @ rotation
-        flat = torch.stack([-local[:, 1], local[:, 0], torch.zeros_like(local[:, 0])], -1)
-        pole = (flat * flat).sum(-1, keepdim=True) < 1e-24
-        y_axis = torch.tensor([0.0, 1.0, 0.0], dtype=flat.dtype, device=flat.device)
-        phi = unit(torch.where(pole, y_axis, flat))
-        vector = phi if radios[r].polarization == "H" else torch.linalg.cross(phi, local)
-        gain = PATTERNS[radios[r].pattern](local)[:, None]
-        out = out.index_copy(0, i, gain * (vector @ rotation.T))
+        local = direction[i] @ radios[r].rotation.to(direction)
+        gain = PATTERNS[radios[r].pattern](local).to(out.dtype)
+        unit_vector = [0.0, 1.0] if radios[r].polarization == "H" else [1.0, 0.0]
+        out = out.index_copy(0, i, gain[:, None] * gain.new_tensor(unit_vector))
     return out
 
 
@@ -369,9 +349,9 @@ def _patterns(
 # delays
 
 
-def _excess(world: World, through: Passages, n: int, frequency: Tensor) -> Float[Tensor, "p"]:
+def _excess(world: World, paths: Paths, through: Passages, frequency: Tensor) -> Float[Tensor, "p"]:
     """Group delay beyond free space of everything crossed, at the first frequency [s]."""
-    total = torch.zeros(n, dtype=torch.float64, device=world.device)
+    total = torch.zeros(len(paths.tx), dtype=torch.float64, device=world.device)
     if not len(through.path):
         return total
     excess = world.excess_delay(through.which, through.crossing, frequency[:1])[:, 0]
@@ -392,7 +372,7 @@ def _doppler(
     v_rx = torch.stack([r.velocity.to(zero) for r in receivers]) if receivers else zero
     growth = (_last(u, paths) * v_rx[paths.rx]).sum(-1) - (u[:, 0] * v_tx[paths.tx]).sum(-1)
     for level in range(paths.which.shape[1]):
-        i, which, contact = _contacts(paths, u, level)
-        rate = ((contact.incoming - contact.outgoing) * world.velocity[which]).sum(-1)
-        growth = growth.index_add(0, i, rate)
+        i = torch.nonzero(paths.which[:, level] >= 0).squeeze(-1)
+        moving = world.velocity[paths.which[i, level]]
+        growth = growth.index_add(0, i, ((u[i, level] - u[i, level + 1]) * moving).sum(-1))
     return -growth * frequency / SPEED_OF_LIGHT

@@ -12,7 +12,7 @@ symmetric in transmitter and receiver by construction.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Jet
@@ -96,6 +96,20 @@ def spreading(
     m = departing @ mixed @ arriving.transpose(-1, -2)
     spread, capped = _capped_root_determinant(m, cap)
     return spread, capped, good
+
+
+def caustics(
+    vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"]
+) -> Int[Tensor, "c"]:
+    """How many caustics each path has passed through: the Morse index of its length.
+
+    The length is a minimum of its neighbours' where no caustic lies between the ends; each one passed
+    turns a direction into a maximum (Morse index theorem; Milnor, Morse Theory, section 15), and each
+    such direction turns e^{-j pi/4} of stationary phase into e^{+j pi/4}. The bordered matrix has one
+    negative eigenvalue more for every surface that holds a vertex.
+    """
+    system = kkt(vertices, jet, lam).matrix
+    return (torch.linalg.eigvalsh(system) < 0).sum(1) - lam.shape[1]
 
 
 def transverse(direction: Float[Tensor, "c 3"]) -> Float[Tensor, "c 2 3"]:

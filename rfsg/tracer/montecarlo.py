@@ -26,8 +26,9 @@ from rfsg.scene.antennas import PATTERNS
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene
 from rfsg.scene.world import World
+from rfsg.tracer.acting import scalar
 from rfsg.tracer.embree import Proxies
-from rfsg.tracer.field import SPEED_OF_LIGHT, scalar
+from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.launch import (
     LEARNED_LIFT,
     ended_before,

@@ -3,11 +3,37 @@
 Index -1 pads short chains. Positions, lengths and delays are float64, in the world frame, SI units.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
+import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
+
+
+class Act(IntEnum):
+    """What a path does at a vertex."""
+
+    REFLECT = 0
+    DIFFRACT = 1
+    SCATTER = 2
+    ENTER = 3  # refracted into a solid
+    LEAVE = 4  # refracted out of it
+
+    @property
+    def word(self) -> str:
+        """For tables: ``reflection(PRIM)`` and so on."""
+        return _WORDS[self]
+
+
+_WORDS = {
+    Act.REFLECT: "reflection",
+    Act.DIFFRACT: "diffraction",
+    Act.SCATTER: "scattering",
+    Act.ENTER: "refraction_in",
+    Act.LEAVE: "refraction_out",
+}
 
 
 class Status(IntEnum):
@@ -88,17 +114,54 @@ class Chains:
 
 @dataclass(frozen=True)
 class Paths:
-    """Exact paths. vertices holds transmitter, reflections, receiver; after the last true point the
-    receiver is repeated, so every consecutive pair is a segment (of length zero in the padding)."""
+    """Exact paths. vertices holds transmitter, interactions, receiver; after the last true point the
+    receiver is repeated, so every consecutive pair is a segment (of length zero in the padding).
+
+    act: what happens at each vertex (``Act``; 0 in the padding). item: the patch of its object's
+    surface, or the edge (its row in ``Edges``), where that says something; -1 elsewhere.
+    caustics: how many the wave has passed through, each of which advances its phase by pi/2.
+    """
 
     tx: Int[Tensor, "p"]
     rx: Int[Tensor, "p"]
     which: Int[Tensor, "p d"]
+    act: Int[Tensor, "p d"]
+    item: Int[Tensor, "p d"]
     vertices: Float[Tensor, "p v 3"]
     normal: Float[Tensor, "p d 3"]
     length: Float[Tensor, "p"]  # [m]
     spread: Float[Tensor, "p"]  # [1/m], 1/length in free space
+    caustics: Int[Tensor, "p"]
     status: Int[Tensor, "p"]
+
+    def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "p"]) -> "Paths":
+        """Some of the paths."""
+        return Paths(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
+
+    def padded(self, depth: int) -> "Paths":
+        """The same paths with room for ``depth`` interactions."""
+        more = depth - self.which.shape[1]
+        if more <= 0:
+            return self
+        none = self.which.new_full((len(self.tx), more), -1)
+        zero = self.normal.new_zeros(len(self.tx), more, 3)
+        return replace(
+            self,
+            which=torch.cat([self.which, none], 1),
+            act=torch.cat([self.act, torch.zeros_like(none)], 1),
+            item=torch.cat([self.item, none], 1),
+            vertices=torch.cat([self.vertices, self.vertices[:, -1:].expand(-1, more, 3)], 1),
+            normal=torch.cat([self.normal, zero], 1),
+        )
+
+    @staticmethod
+    def joined(parts: "Sequence[Paths]") -> "Paths":
+        """All paths of several records, padded to the longest."""
+        depth = max(p.which.shape[1] for p in parts)
+        parts = [p.padded(depth) for p in parts]
+        return Paths(
+            *(torch.cat([getattr(p, n) for p in parts]) for n in Paths.__dataclass_fields__)
+        )
 
 
 @dataclass(frozen=True)
@@ -107,6 +170,10 @@ class Channel:
 
     ``gain`` leaves out the propagation phase of ``delay``; path gain is |gain|^2. ``crossed`` lists
     (path, node, segment) of objects that a path goes through, in order along each path.
+
+    ``gain`` is between the reference ports of the two radios. ``jones``, where a radio is polarised,
+    holds the transfer without antennas from (theta, phi) of the transmitter's own frame (columns) to
+    (theta, phi) of the receiver's (rows), spreading and lambda / 4 pi included; else None.
     """
 
     tx: Int[Tensor, "p"]
@@ -119,3 +186,4 @@ class Channel:
     arrival: Float[Tensor, "p 3"]  # unit vector, world, from the receiver back towards the wave
     crossed: Int[Tensor, "x 3"]
     blocked: Bool[Tensor, "p"]
+    jones: Complex[Tensor, "p f 2 2"] | None = None

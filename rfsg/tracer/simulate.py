@@ -89,9 +89,18 @@ def simulate(
         with _timed(seconds, "solve", tell):
             wavelength = SPEED_OF_LIGHT / float(frequencies[0])
             paths, counts = solve(world, chains, tx, rx, wavelength, quality)
+            edges, found = None, [paths]
+            paths = Paths.joined(found)
         with _timed(seconds, "field", tell):
             channel = fields.channel(
-                world, proxies, paths, scene.transmitters, scene.receivers, frequencies, quality
+                world,
+                proxies,
+                paths,
+                scene.transmitters,
+                scene.receivers,
+                frequencies,
+                quality,
+                edges,
             )
             paths, channel, counts = _above_floor(paths, channel, counts, quality)
     named = {s.name: n for s, n in sorted(counts.items())}
@@ -167,7 +176,10 @@ def _above_floor(
     number[keep] = torch.arange(len(keep), device=drop.device)
     crossed = channel.crossed[~drop[channel.crossed[:, 0]]]
     crossed = torch.cat([number[crossed[:, :1]], crossed[:, 1:]], -1)
-    paths = replace(paths, **{n: getattr(paths, n)[keep] for n in Paths.__dataclass_fields__})
-    per_path = [n for n in Channel.__dataclass_fields__ if n not in ("frequency", "crossed")]
+    paths = paths.take(keep)
+    per_path = [
+        n for n in Channel.__dataclass_fields__ if n not in ("frequency", "crossed", "jones")
+    ]
     kept = {n: getattr(channel, n)[keep] for n in per_path}
+    kept["jones"] = None if channel.jones is None else channel.jones[keep]
     return paths, replace(channel, crossed=crossed, **kept), counts

@@ -18,6 +18,7 @@ from torch import Tensor
 from rfsg.scene.world import World, unit
 from rfsg.tracer import zone
 from rfsg.tracer.implicit import (
+    caustics,
     kkt,
     multipliers,
     segments,
@@ -38,11 +39,12 @@ GRAZING = 1e-9  # cosine below which a path runs along a face and is not reflect
 
 @dataclass(frozen=True)
 class Solved:
-    """Exact vertices, normals, spreading [1/m] and status of a batch."""
+    """Exact vertices, normals, spreading [1/m], caustics passed and status of a batch."""
 
     vertices: Float[Tensor, "c k 3"]
     normal: Float[Tensor, "c d 3"]
     spread: Float[Tensor, "c"]
+    caustics: Int[Tensor, "c"]
     status: Int[Tensor, "c"]
 
 
@@ -134,7 +136,7 @@ def _direct(batch: Batch, wavelength: float) -> Solved:
     spread, capped = _capped_inverse(length[:, 0], wavelength)
     status = torch.where(capped, int(Status.CAUSTIC_CAPPED), int(Status.OK))
     status = torch.where(good, status, int(Status.DEGENERATE))
-    return Solved(vertices, batch.x, spread, status)
+    return Solved(vertices, batch.x, spread, torch.zeros_like(status), status)
 
 
 def _capped_inverse(length: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
@@ -171,7 +173,7 @@ def _images(world: World, batch: Batch) -> Solved:
     batch.x = x
     status = _validate(world, batch, batch.polyline(x), normal, None)
     status = torch.where(square == 0, int(Status.DEGENERATE), status)
-    return Solved(batch.polyline(x), normal, 1.0 / length, status)
+    return Solved(batch.polyline(x), normal, 1.0 / length, torch.zeros_like(status), status)
 
 
 # anything else: Newton on the Lagrangian
@@ -193,6 +195,7 @@ def _stationary(world: World, batch: Batch, wavelength: float, quality: Quality)
     spread, capped, regular = spreading(vertices, jet, lam, cap)
     normal = unit(jet.gradient)
     with torch.no_grad():
+        passed = caustics(vertices, jet, lam)
         outcome = _validate(world, part, vertices, normal, facets, wavelength)
         good = outcome == int(Status.OK)
         outcome = torch.where(good & ~regular, int(Status.DEGENERATE), outcome)
@@ -202,6 +205,7 @@ def _stationary(world: World, batch: Batch, wavelength: float, quality: Quality)
         batch.polyline().index_copy(0, found, vertices),
         torch.zeros_like(batch.x).index_copy(0, found, normal),
         torch.zeros_like(batch.x[:, 0, 0]).index_copy(0, found, spread),
+        torch.zeros_like(status).index_copy(0, found, passed),
         status,
     )
 
@@ -362,6 +366,7 @@ def _pad(solved: Solved, most: int) -> Solved:
         torch.cat([solved.vertices, tail], 1),
         torch.cat([solved.normal, normal], 1),
         solved.spread,
+        solved.caustics,
         solved.status,
     )
 
@@ -378,7 +383,11 @@ def _gather(
     if not parts:
         empty = torch.zeros(0, dtype=torch.float64, device=device)
         blank = Solved(
-            empty.reshape(0, most + 2, 3), empty.reshape(0, most, 3), empty, chains.tx.clone()
+            empty.reshape(0, most + 2, 3),
+            empty.reshape(0, most, 3),
+            empty,
+            chains.tx.clone(),
+            chains.tx.clone(),
         )
         parts = [(chains.tx, blank)]
     index = torch.cat([i for i, _ in parts])
@@ -396,10 +405,13 @@ def _gather(
             chains.tx[keep],
             chains.rx[keep],
             chains.which[keep],
+            torch.zeros_like(chains.which[keep]),  # all of them reflections
+            chains.patch[keep],
             vertices,
             whole.normal[keep],
             segments(vertices)[0].sum(1),
             whole.spread[keep],
+            whole.caustics[keep],
             whole.status[keep],
         ),
         counts,
