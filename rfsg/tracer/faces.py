@@ -69,42 +69,31 @@ class Samples:
 @torch.no_grad()
 def planes_of(world: World) -> Planes:
     """Every planar face in the world; a face reaches as far as its object's bounds."""
-    rows = []
-    for node, item in enumerate(world.scene.nodes):
-        table = item.body.shape.planes().to(device=world.device, dtype=torch.float64)
-        for patch in range(table.shape[0]):
-            rows.append(_plane(world, node, patch, table[patch]))
-    if not rows:
-        zero = torch.zeros(0, dtype=torch.float64, device=world.device)
-        none = torch.zeros(0, dtype=torch.int64, device=world.device)
-        flat = zero.reshape(0, 3)
-        return Planes(none, none, flat, zero, flat, zero.reshape(0, 2, 3), zero.reshape(0, 2))
-    node, patch = torch.tensor([r[:2] for r in rows], device=world.device).unbind(1)
-    normal, offset, centre, edges, half = (
-        torch.stack(c) for c in zip(*(r[2:] for r in rows), strict=True)
-    )
-    return Planes(node, patch, normal, offset, centre, edges, half)
-
-
-def _plane(world: World, node: int, patch: int, row: Tensor) -> tuple:
-    """One face in the world, from its row (n, d) and its object's box."""
-    which = torch.tensor([node], device=world.device)
-    normal, low, high = row[:3], *world.bounds_object[node]
-    axis = int(normal.abs().argmax())
-    others = [a for a in range(3) if a != axis]
-    eye = torch.eye(3, dtype=torch.float64, device=world.device)
+    tables = {id(n.body.shape): n.body.shape.planes() for n in world.scene.nodes}
+    rows = [tables[id(n.body.shape)].to(world.translation) for n in world.scene.nodes]
+    each = [torch.arange(len(table), device=world.device) for table in rows]
+    node = torch.arange(len(rows), device=world.device)
+    node = node.repeat_interleave(torch.tensor([len(t) for t in rows], dtype=torch.int64).to(node))
+    blank = world.translation.new_zeros(0, 4)
+    patch, row = torch.cat([node[:0], *each]), torch.cat([blank, *rows])
+    normal, (low, high) = row[:, :3], world.bounds_object[node].unbind(1)
     middle = torch.where(torch.isfinite(low + high), 0.5 * (low + high), torch.zeros_like(low))
-    centre = middle + (row[3] - middle @ normal) * normal
-    half = (0.5 * (high - low))[others] * world.scale[node]
-    return (
+    centre = middle + (row[:, 3] - (middle * normal).sum(-1))[:, None] * normal
+    axis = normal.abs().argmax(-1, keepdim=True) if len(row) else node[:, None]
+    others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=world.device)[axis.squeeze(-1)]
+    eye = torch.eye(3, dtype=torch.float64, device=world.device)
+    edges = [world.direction_world(node, eye[others[:, k]]) for k in (0, 1)]
+    half = (0.5 * (high - low)).gather(1, others) * world.scale[node, None]
+    normal_world = world.direction_world(node, normal)
+    place = (normal_world * world.translation[node]).sum(-1)
+    return Planes(
         node,
         patch,
-        world.direction_world(which, normal[None])[0],
-        row[3] * world.scale[node]
-        + world.direction_world(which, normal[None])[0] @ world.translation[node],
-        world.point_world(which, centre[None])[0],
-        world.direction_world(which.repeat(2), eye[others]),
-        torch.where(torch.isfinite(half), half, torch.full_like(half, torch.inf)),
+        normal_world,
+        row[:, 3] * world.scale[node] + place,
+        world.point_world(node, centre),
+        torch.stack(edges, 1),
+        half,
     )
 
 

@@ -57,9 +57,9 @@ def enumerate_chains(
     budget = Budget(MOST_PAIRS)
     parts = []
     inner = min(quality.depth, quality.curved_depth) - 1 if samples else 0
-    behind = [_levels(planes, rx_position[r], inner, budget) for r in range(len(rx_position))]
+    behind = [levels(planes, rx_position[r], inner, budget) for r in range(len(rx_position))]
     for t in range(len(tx_position)):
-        ahead = _levels(planes, tx_position[t], quality.depth, budget)
+        ahead = levels(planes, tx_position[t], quality.depth, budget)
         for level in ahead[1:]:
             parts.append(_planar_chains(planes, level, t, rx_position, quality, budget))
         for item in samples:
@@ -82,7 +82,7 @@ class Budget:
             raise TooMany
 
 
-def _levels(planes: Planes, source: Tensor, depth: int, budget: Budget) -> list[Prefixes]:
+def levels(planes: Planes, source: Tensor, depth: int, budget: Budget) -> list[Prefixes]:
     """Prefixes of 0, 1, ... depth faces from a source."""
     none = torch.zeros(1, 0, dtype=torch.int64, device=source.device)
     levels = [Prefixes(source[None], none)]
@@ -120,12 +120,13 @@ def _mirror(planes: Planes, point: Tensor, face: Tensor) -> Tensor:
 
 def _visible(planes: Planes, prefixes: Prefixes) -> Bool[Tensor, "p k"]:
     """Faces with some corner on the outgoing side of the prefix's last face, and not that face."""
-    last = prefixes.faces[:, -1]
-    corners = planes.corners().reshape(-1, 3)
-    height = (corners @ planes.normal.T).reshape(len(planes), 4, -1) - planes.offset
-    beyond = height.amax(1).T > 0  # [last, face]
-    beyond = beyond & ~torch.eye(len(planes), dtype=torch.bool, device=beyond.device)
-    return beyond[last]
+    last, row = torch.unique(prefixes.faces[:, -1], return_inverse=True)
+    # only of the last faces at hand: of all faces at once it would be a table of gigabytes
+    height = planes.normal[last] @ planes.corners().reshape(-1, 3).T
+    highest = height.reshape(len(last), len(planes), 4).amax(-1)
+    beyond = highest - planes.offset[last, None] > 0
+    beyond[torch.arange(len(last), device=last.device), last] = False
+    return beyond[row]
 
 
 def _in_beam(planes: Planes, prefixes: Prefixes, row: Tensor, face: Tensor) -> Bool[Tensor, "m"]:
