@@ -71,5 +71,6 @@ def test_which_faces_may_come_next_against_a_plain_loop():
     corners = faces.corners()
     for row, k in enumerate(last[:, 1].tolist()):
         for face in range(len(faces)):
-            height = corners[face] @ faces.normal[k] - faces.offset[k]
-            assert bool(found[row, face]) == (face != k and float(height.max()) > 0)
+            highest = float((corners[face] @ faces.normal[k] - faces.offset[k]).max())
+            if face == k or abs(highest) > 1e-9:  # faces that share an edge: as rounding has it
+                assert bool(found[row, face]) == (face != k and highest > 0)
