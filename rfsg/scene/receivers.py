@@ -6,14 +6,14 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from rfsg.scene.antennas import PATTERNS
+from rfsg.scene.antennas import PATTERNS, POLARIZATIONS
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import SceneError
 
 MAX_RECEIVERS = 100_000  # one Python object each; a radio map takes a plane instead
 MAX_CSV_BYTES = 32 * 2**20
 NUMBERS = ("x", "y", "z", "yaw_deg")  # [m], [m], [m], [deg]
-TOKENS = {"pattern": tuple(PATTERNS), "polarization": ("none", "V", "H")}
+TOKENS = {"pattern": tuple(PATTERNS), "polarization": tuple(POLARIZATIONS)}
 
 
 def grid(
@@ -107,7 +107,8 @@ def _radio(row: dict[str, str], where: str, parent: str, faults: list[str]) -> R
         for c, given in tokens.items()
         if given not in TOKENS[c]
     ]
-    return Radio.at(f"{parent}/{'_' * name[:1].isdigit()}{name}", x, y, z, yaw, **tokens)
+    known = {c: given for c, given in tokens.items() if given in TOKENS[c]}
+    return Radio.at(f"{parent}/{'_' * name[:1].isdigit()}{name}", x, y, z, yaw, **known)
 
 
 def _number(text: str, where: str, faults: list[str]) -> float:

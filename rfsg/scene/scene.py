@@ -14,17 +14,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rfsg.objects.body import Body
+from rfsg.scene.errors import SceneError as SceneError
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
-
-
-class SceneError(Exception):
-    """A scene, an asset or an edit is at fault. ``faults`` lists every fault found, each one line
-    that begins with the prim path or the file."""
-
-    def __init__(self, faults: Sequence[str]):
-        self.faults = tuple(faults)
-        super().__init__("\n".join(self.faults))
 
 
 @dataclass(frozen=True)

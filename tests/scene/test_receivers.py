@@ -57,7 +57,7 @@ def test_csv_names_file_line_and_column_of_every_fault(tmp_path):
     assert list(error.value.faults) == [
         f"{path}:2: y: expected a finite number, got 'two'",
         f"{path}:3: z: expected a finite number, got 'nan'",
-        f"{path}:4: polarization: expected one of none, V, H, got 'up'",
+        f"{path}:4: polarization: expected one of none, V, H, +45, -45, VH, cross, got 'up'",
         f"{path}:4: name: 'a' stands twice",
         f"{path}:5: expected 5 cells, one for each column",
         f"{path}:6: name: is empty",
