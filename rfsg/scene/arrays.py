@@ -29,7 +29,7 @@ class Array:
     """
 
     offsets: Float[Tensor, "n 3"]
-    unit: str = "m"
+    unit: str = "wavelength"
     layout: tuple[int, int, float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -65,10 +65,10 @@ class Array:
         fastest and the column grows with y, as in figure 7.3-1 and in the codebooks of TS 38.214.
         """
         whole = all(isinstance(n, int) and n > 0 for n in (rows, columns))
-        if not whole or not all(math.isfinite(s) and s >= 0 for s in (spacing_v, spacing_h)):
+        if not whole or not all(math.isfinite(s) and s > 0 for s in (spacing_v, spacing_h)):
             raise SceneError(
                 [f"array: {rows} rows and {columns} columns with spacings {spacing_v} and {spacing_h}; "
-                 "expected whole numbers > 0 and spacings >= 0"]
+                 "expected whole numbers and spacings > 0"]
             )  # fmt: skip
         _count(rows * columns)
         z = (torch.arange(rows, dtype=torch.float64) - (rows - 1) / 2) * spacing_v
@@ -78,7 +78,7 @@ class Array:
         return Array(offsets, unit, (rows, columns, float(spacing_v), float(spacing_h)))
 
     @staticmethod
-    def of(offsets: Sequence[Sequence[float]], unit: str = "m") -> "Array":
+    def of(offsets: Sequence[Sequence[float]], unit: str = "wavelength") -> "Array":
         """Elements at any places (x, y, z). SceneError for what is not triples of numbers."""
         try:
             return Array(torch.tensor(offsets, dtype=torch.float64), unit)
@@ -86,7 +86,7 @@ class Array:
             raise SceneError([f"array: expected triples of numbers: {error}"]) from error
 
     @staticmethod
-    def from_csv(path: str | Path, unit: str = "m") -> "Array":
+    def from_csv(path: str | Path, unit: str = "wavelength") -> "Array":
         """Elements from a CSV file with the columns x, y and z.
 
         Raises SceneError listing every fault with file and line."""

@@ -7,7 +7,11 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from rfsg.scene.antennas import PATTERNS
+import numpy as np
+from numpy import ndarray
+
+from rfsg.scene.antennas import PATTERNS, POLARIZATIONS
+from rfsg.scene.arrays import MAX_ELEMENTS, UNITS
 from rfsg.scene.materials import MODELS
 from rfsg.scene.weights import FORMAT_VERSION
 
@@ -31,6 +35,12 @@ class Field:
         if self.kind in ("float3", "double3"):
             fine = isinstance(value, tuple) and len(value) == 3 and all(map(math.isfinite, value))
             return None if fine else "three finite numbers"
+        if self.kind == "double3[]":
+            fine = isinstance(value, ndarray) and value.ndim == 2 and value.shape[1] == 3
+            fine = fine and 1 <= len(value) <= MAX_ELEMENTS and bool(np.isfinite(value).all())
+            return None if fine else f"1 to {MAX_ELEMENTS} triples of finite numbers"
+        if self.kind == "int" and self.positive:
+            return None if isinstance(value, int) and value > 0 else "a whole number > 0"
         if self.tokens:
             return None if value in self.tokens else f"one of {', '.join(self.tokens)}"
         wanted = {"int": int, "bool": bool}.get(self.kind, str)
@@ -59,7 +69,14 @@ RADIO = (
     Field("rfsg:radio:powerDbm", "double", fallback=0.0),
     Field("rfsg:radio:frequencyHz", "double", positive=True),
     Field("rfsg:radio:pattern", "token", tokens=tuple(PATTERNS), fallback="isotropic"),
-    Field("rfsg:radio:polarization", "token", tokens=("none", "V", "H"), fallback="none"),
+    Field("rfsg:radio:patternFile", "asset"),
+    Field("rfsg:radio:polarization", "token", tokens=tuple(POLARIZATIONS), fallback="none"),
+    Field("rfsg:radio:array:rows", "int", positive=True),
+    Field("rfsg:radio:array:columns", "int", positive=True),
+    Field("rfsg:radio:array:spacingVertical", "double", positive=True, fallback=0.5),
+    Field("rfsg:radio:array:spacingHorizontal", "double", positive=True, fallback=0.5),
+    Field("rfsg:radio:array:offsets", "double3[]"),
+    Field("rfsg:radio:array:unit", "token", tokens=UNITS, fallback="wavelength"),
 )
 SHAPE = Field("rfsg:shape", "token", tokens=("halfspace",))
 VELOCITY = Field("rfsg:velocity", "double3")

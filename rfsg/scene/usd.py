@@ -29,6 +29,7 @@ from rfsg.objects.body import Body
 from rfsg.objects.catalogue import shape_class
 from rfsg.objects.contract import Shape, Surface
 from rfsg.scene import files
+from rfsg.scene.arrays import Array
 from rfsg.scene.fields import (
     FIELDS,
     FREQUENCY,
@@ -40,6 +41,7 @@ from rfsg.scene.fields import (
     Field,
 )
 from rfsg.scene.materials import Material, material_of
+from rfsg.scene.patterns import MAX_PATTERN_BYTES, Pattern, parse
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Node, Scene, SceneError
@@ -57,6 +59,8 @@ from rfsg.scene.weights import (
 
 NEURAL_API, MATERIAL_API, RADIO_API = "RfsgNeuralObjectAPI", "RfsgMaterialAPI", "RfsgRadioAPI"
 SCHEMA_FOLDER = Path(__file__).with_name("schema")
+WEIGHTS, PATTERN_FILE = "rfsg:neural:weights", "rfsg:radio:patternFile"
+ARRAY = ("rows", "columns", "spacingVertical", "spacingHorizontal", "offsets", "unit")
 MAX_PRIMS = 200_000
 SHOWN = 12  # paths named in a warning before "and more"
 
@@ -71,6 +75,7 @@ USD_TYPES = {
     "double": _TYPES.Double,
     "float3": _TYPES.Float3,
     "double3": _TYPES.Double3,
+    "double3[]": _TYPES.Double3Array,
 }
 
 
@@ -279,6 +284,7 @@ class _Reader:
     radios: dict[str, list[Radio]] = field(default_factory=lambda: {"tx": [], "rx": []})
     decor: list[str] = field(default_factory=list)
     weights: dict[tuple[str, str], Body] = field(default_factory=dict)
+    patterns: dict[str, Pattern] = field(default_factory=dict)  # by resolved path
     surfaces: dict[Any, Surface] = field(default_factory=dict)
     bodies: dict[Any, Body] = field(default_factory=dict)
     world: np.ndarray = field(default_factory=lambda: np.eye(4))  # world [m, z up] from stage
@@ -488,7 +494,7 @@ class _Reader:
 
     def _trained(self, prim: Usd.Prim, where: str) -> Body:
         """The body of a prim's weights, read once for all prims with the same file and hash."""
-        resolved, given = _weights_path(prim, self.roots, where)
+        resolved, given = _asset_path(prim, WEIGHTS, self.roots, where)
         key = (resolved, prim.GetAttribute("rfsg:neural:sha256").Get())
         if key not in self.weights:
             data = _weights_bytes(prim, resolved, given, where)
@@ -550,19 +556,65 @@ class _Reader:
         velocity = _attempt(faults, lambda: self._velocity(prim))
         if faults or said is None or pose is None or velocity is None:
             raise SceneError(faults)
-        role, power, frequency, pattern, polarization = said.values()
-        self.radios[role].append(
+        pattern = _attempt(faults, lambda: self._pattern(prim))
+        array = _attempt(faults, lambda: self._array(prim, said))
+        if faults:
+            raise SceneError(faults)
+        if pattern is not None and pattern.vector and said["rfsg:radio:polarization"] == "none":
+            self.warnings.append(
+                f"{prim.GetPath()}: the pattern's field is measured, but rfsg:radio:polarization is "
+                "none: where no radio is polarised only its magnitude counts; V takes it as it is"
+            )
+        self.radios[said["rfsg:radio:role"]].append(
             Radio(
                 str(prim.GetPath()),
                 pose.translation.to(self.device),
                 pose.rotation.to(self.device),
                 velocity,
-                power,
-                frequency,
-                pattern,
-                polarization,
+                said["rfsg:radio:powerDbm"],
+                said["rfsg:radio:frequencyHz"],
+                pattern or said["rfsg:radio:pattern"],
+                said["rfsg:radio:polarization"],
+                array,
             )
         )
+
+    def _pattern(self, prim: Usd.Prim) -> Pattern | None:
+        """The measured pattern of a radio, read once for all radios with the same file."""
+        where = str(prim.GetPath())
+        if not prim.GetAttribute(PATTERN_FILE).Get():
+            return None
+        resolved, given = _asset_path(prim, PATTERN_FILE, self.roots, where)
+        if resolved not in self.patterns:
+            data = _asset_bytes(resolved, f"{where}: patternFile {given!r}", MAX_PATTERN_BYTES)
+            pattern = parse(data, f"{where}: {given}", resolved)
+            self.patterns[resolved] = pattern
+            self.warnings += [f"{where}: {warning}" for warning in pattern.warnings()]
+        return self.patterns[resolved]
+
+    def _array(self, prim: Usd.Prim, said: Mapping[str, Any]) -> Array | None:
+        """The array that a radio's attributes describe, or None where they say nothing."""
+        rows, columns, vertical, horizontal, offsets, unit = (
+            said[f"rfsg:radio:array:{name}"] for name in ARRAY
+        )
+        planar = rows is not None or columns is not None
+        where = prim.GetPath()
+        if planar and offsets is not None:
+            raise SceneError(
+                [
+                    f"{where}: rfsg:radio:array has offsets as well as rows or columns; say one of them"
+                ]
+            )
+        try:
+            if offsets is not None:
+                return Array(torch.from_numpy(offsets), unit)
+            return (
+                Array.planar(rows or 1, columns or 1, vertical, horizontal, unit)
+                if planar
+                else None
+            )
+        except SceneError as error:
+            raise SceneError([f"{where}: {fault}" for fault in error.faults]) from error
 
     # its values
 
@@ -575,7 +627,7 @@ class _Reader:
             value = attribute.Get(self.time) if attribute.HasAuthoredValue() else None
             values[item.name] = item.fallback if value is None else _plain(value, item.kind)
             if value is not None and (amiss := item.amiss(values[item.name])):
-                faults.append(f"{prim.GetPath()}: {item.name} is {value!r}; expected {amiss}")
+                faults.append(f"{prim.GetPath()}: {item.name} is {_brief(value)}; expected {amiss}")
         if faults:
             raise SceneError(faults)
         return values
@@ -758,9 +810,17 @@ def _plain(value: Any, kind: str) -> Any:
         return value.path
     if kind in ("float3", "double3") and hasattr(value, "__len__") and not isinstance(value, str):
         return tuple(float(v) for v in value)
+    if kind == "double3[]" and isinstance(value, (Vt.Vec3dArray, Vt.Vec3fArray)):
+        return np.array(value, dtype=np.float64)
     if kind == "double" and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     return value
+
+
+def _brief(value: Any) -> str:
+    """A value as a message shows it: an array by its length, for it may hold millions."""
+    array = hasattr(value, "__len__") and not isinstance(value, str) and len(value) > 4
+    return f"an array of {len(value)}" if array else repr(value)
 
 
 def _spec(prim: Usd.Prim) -> Usd.Prim:
@@ -826,7 +886,7 @@ def read_asset(path: Path) -> AssetRecord:
             raise SceneError([f"{path}: holds {len(found)} neural objects; expected one"])
         prim = root if root in found else found[0]
         where = str(prim.GetPath())
-        resolved, given = _weights_path(prim, roots, where)
+        resolved, given = _asset_path(prim, WEIGHTS, roots, where)
         data = _weights_bytes(prim, resolved, given, where)
         story = prim.GetAttribute("rfsg:neural:provenance").Get() or "{}"
         layer = stage.GetRootLayer()
@@ -916,32 +976,25 @@ def _vectors(values: np.ndarray) -> Vt.Vec3fArray:
     return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))
 
 
-def _weights_path(prim: Usd.Prim, roots: Sequence[Path], where: str) -> tuple[str, str]:
-    """(resolved path, path as given) of a prim's weights, which may be read."""
-    value = prim.GetAttribute("rfsg:neural:weights").Get()
+def _asset_path(prim: Usd.Prim, name: str, roots: Sequence[Path], where: str) -> tuple[str, str]:
+    """(resolved path, path as given) of the file that an attribute names, which may be read."""
+    value = prim.GetAttribute(name).Get()
     if isinstance(value, Sdf.AssetPath):
         given, anchored = value.path, value.resolvedPath
     else:  # Blender's round trip turns asset paths into strings, without their anchor
         given = str(value or "")
         anchored = prim.GetStage().GetRootLayer().ComputeAbsolutePath(given) if given else ""
     if not given:
-        raise SceneError([f"{where}: rfsg:neural:weights is empty"])
+        raise SceneError([f"{where}: {name} is empty"])
     resolved, why = _look_up(given, anchored, roots)
     if why or not resolved:
-        raise SceneError([f"{where}: weights {given!r} {why or 'not found'}"])
+        raise SceneError([f"{where}: {name.split(':')[-1]} {given!r} {why or 'not found'}"])
     return resolved, given
 
 
 def _weights_bytes(prim: Usd.Prim, resolved: str, given: str, where: str) -> bytes:
-    """The weights' bytes, of bounded size and the right hash; through Ar, so packages work."""
-    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved))
-    size = asset.GetSize() if asset else 0
-    if not asset or size > MAX_WEIGHTS_BYTES:
-        amiss = (
-            f"take {size} bytes; the limit is {MAX_WEIGHTS_BYTES}" if asset else "cannot be opened"
-        )
-        raise SceneError([f"{where}: weights {given!r} {amiss}"])
-    data = bytes(asset.Read(size, 0)) if size else b""
+    """The weights' bytes, of bounded size and the right hash."""
+    data = _asset_bytes(resolved, f"{where}: weights {given!r}", MAX_WEIGHTS_BYTES)
     said, actual = prim.GetAttribute("rfsg:neural:sha256").Get(), digest(data)
     if said != actual:
         raise SceneError(
@@ -949,6 +1002,16 @@ def _weights_bytes(prim: Usd.Prim, resolved: str, given: str, where: str) -> byt
              "the file was changed, or is not the one this asset was saved with"]
         )  # fmt: skip
     return data
+
+
+def _asset_bytes(resolved: str, what: str, limit: int) -> bytes:
+    """A file's bytes, of bounded size; through Ar, so packages work."""
+    asset = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(resolved))
+    size = asset.GetSize() if asset else 0
+    if not asset or size > limit:
+        amiss = f"take {size} bytes; the limit is {limit}" if asset else "cannot be opened"
+        raise SceneError([f"{what} {amiss}"])
+    return bytes(asset.Read(size, 0)) if size else b""
 
 
 # ---- writing ----------------------------------------------------------------------------------
@@ -984,6 +1047,7 @@ class _Writer:
         self.placed: dict[str, np.ndarray] = {}  # world matrices of what stands in the stage
         self.materials: dict[int, UsdShade.Material] = {}  # by identity of the surface
         self.assets: dict[int | Path, Path] = {}  # by identity of the body, or by the original
+        self.patterns: dict[int, Path] = {}  # by identity of the pattern
         self.records: dict[str, AssetRecord] = {}
         source = scene.source
         names = source.material_names if isinstance(source, Source) else ()
@@ -1079,6 +1143,23 @@ class _Writer:
         taken = {file.stem for file in self.assets.values()}
         return folder / f"{_unused(name, taken)}.usda"
 
+    def _pattern_file(self, pattern: Pattern) -> Sdf.AssetPath:
+        """The file that a pattern came from, if the new scene may read it and it still holds the
+        same; else a copy beside the scene, as CSV."""
+        if id(pattern) not in self.patterns:
+            file = Path(pattern.file) if pattern.file else None
+            root = files.default_root(self.path)
+            here = file is not None and file.is_file() and not files.outside(str(file), [root])
+            if file is None or not here or not _still(file, pattern):
+                stem = Path(pattern.name).stem or "pattern"
+                taken = {f.stem for f in self.patterns.values()}
+                folder = self.path.with_name(f"{self.path.stem}_assets")
+                folder.mkdir(exist_ok=True)
+                file = folder / f"{_unused(stem, taken)}.csv"
+                write_beside(file, pattern.csv(), self.overwrite)
+            self.patterns[id(pattern)] = file
+        return Sdf.AssetPath(_relative(self.patterns[id(pattern)], self.path.parent))
+
     def _bind(self, prim: Usd.Prim, surface: Surface, material: Material) -> None:
         if id(surface) not in self.materials:
             taken = {m.GetPrim().GetName() for m in self.materials.values()}
@@ -1091,7 +1172,18 @@ class _Writer:
 
     def _radio(self, role: str, radio: Radio) -> None:
         prim = self._define(radio.path, "Xform")
-        values = (role, radio.power_dbm, radio.frequency, radio.pattern, radio.polarization)
+        name, file = radio.pattern, None
+        if isinstance(name, Pattern):
+            name, file = None, self._pattern_file(name)
+        values = (
+            role,
+            radio.power_dbm,
+            radio.frequency,
+            name,
+            file,
+            radio.polarization,
+            *_array_values(radio.array),
+        )
         _author(prim, dict(zip(RADIO, values, strict=True)), RADIO_API)
         one = torch.ones((), dtype=torch.float64)
         self._place(prim, Pose(radio.rotation, radio.position, one), np.ones(3))
@@ -1135,6 +1227,24 @@ _SHAPES = {
     "capsule": "Capsule",
     "halfspace": "Xform",
 }
+
+
+def _still(file: Path, pattern: Pattern) -> bool:
+    """Whether a file holds the pattern that was once read from it."""
+    try:
+        return Pattern.from_file(file).same(pattern)
+    except SceneError:
+        return False
+
+
+def _array_values(array: Array | None) -> tuple[Any, ...]:
+    """An array as the attributes of ``ARRAY``."""
+    if array is None:
+        return (None,) * len(ARRAY)
+    if array.layout is not None:
+        return (*array.layout, None, array.unit)
+    offsets = Vt.Vec3dArray.FromNumpy(np.ascontiguousarray(_numpy(array.offsets)))
+    return (None, None, None, None, offsets, array.unit)
 
 
 def _new_stage() -> Usd.Stage:
