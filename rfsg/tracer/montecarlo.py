@@ -22,8 +22,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Contact
-from rfsg.scene.antennas import PATTERNS
-from rfsg.scene.radios import Radio
+from rfsg.scene.radios import Radio, amplitude
 from rfsg.scene.scene import Scene
 from rfsg.scene.world import World
 from rfsg.tracer.acting import scalar
@@ -91,7 +90,7 @@ def flights(
     lattice = fibonacci(per_copy, world.device)
     for copy in range(COPIES):
         direction = lattice @ _turn(generator).to(world.device)
-        pattern = PATTERNS[transmitter.pattern](direction @ transmitter.rotation.to(direction))
+        pattern = amplitude(transmitter, direction @ transmitter.rotation.to(direction))
         rays = Rays(
             position.expand(per_copy, 3).clone(),
             direction,
@@ -210,5 +209,5 @@ def _collected(flight: Flight, receiver: Radio, position: Tensor, radius: float)
     across = (away - along[:, None] * flight.rays.direction).norm(dim=-1)
     ray = torch.nonzero((across < radius) & (along > 0)).squeeze(-1)
     arriving = -flight.rays.direction[ray] @ receiver.rotation.to(along)
-    pattern = PATTERNS[receiver.pattern](arriving) ** 2
+    pattern = amplitude(receiver, arriving) ** 2
     return (flight.power_at(ray, along[ray]) * pattern).sum()
