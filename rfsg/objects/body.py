@@ -3,7 +3,8 @@
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
-from rfsg.objects.contract import Contact, Crossing, Shape, Surface
+from rfsg.objects.contract import Contact, Crossing, Scatters, Shape, Surface
+from rfsg.objects.physics.lobes import Scattering
 
 
 class Body(nn.Module):
@@ -21,6 +22,17 @@ class Body(nn.Module):
         self, contact: Contact, frequency: Float[Tensor, "f"]
     ) -> Complex[Tensor, "*b f 2"]:
         return self.surface.reflection(self.shape, contact, frequency)
+
+    @property
+    def scattering(self) -> Scattering | None:
+        """How the surface scatters; None where it is smooth."""
+        rough = self.surface.scattering if isinstance(self.surface, Scatters) else None
+        return rough if rough is not None and rough.active else None
+
+    def diffuse(self, contact: Contact, frequency: Float[Tensor, "f"]) -> Complex[Tensor, "*b f 2"]:
+        """Amplitudes (TE, TM) of the diffuse wave, of a surface that scatters."""
+        assert isinstance(self.surface, Scatters)
+        return self.surface.diffuse(self.shape, contact, frequency)
 
     def transmission(
         self, crossing: Crossing, frequency: Float[Tensor, "f"]

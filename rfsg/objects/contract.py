@@ -16,6 +16,8 @@ from typing import Protocol, runtime_checkable
 from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
+from rfsg.objects.physics.lobes import Scattering
+
 
 @dataclass(frozen=True)
 class Jet:
@@ -131,6 +133,23 @@ class Surface(Protocol):
         self, shape: Shape, crossing: Crossing, frequency: Float[Tensor, "f"]
     ) -> Float[Tensor, "*b f"]:
         """Group delay of a crossing beyond free space over the same stretch [s]."""
+        ...
+
+
+@runtime_checkable
+class Scatters(Protocol):
+    """A Surface that may be rough. ``reflection`` is then the mirror's share alone."""
+
+    @property
+    def scattering(self) -> Scattering | None:
+        """Where to it scatters; None for a smooth surface."""
+        ...
+
+    def diffuse(
+        self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """Amplitude (TE, TM) of the diffuse wave in all directions together: the square is the
+        share of the arriving power that scatters. Asked with ``outgoing`` in mirror direction."""
         ...
 
 

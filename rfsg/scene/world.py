@@ -23,6 +23,7 @@ class World:
     """A scene laid out as tensors: poses stacked, bodies listed once. ``which`` indexes nodes.
 
     samples, integral: how crossings of learned surfaces are integrated; None leaves it to each.
+    diffuse: whether learned surfaces part with their diffuse share; known ones always do.
     """
 
     def __init__(
@@ -32,6 +33,7 @@ class World:
         *,
         samples: int | None = None,
         integral: str = "telescoped",
+        diffuse: bool = False,
     ):
         self.scene = scene
         self.device = torch.device(device)
@@ -46,7 +48,7 @@ class World:
             [_shape_key(n.body) for n in nodes], self.device
         )
         bodies, self.surface_of_node = _distinct([_surface_key(n.body) for n in nodes], self.device)
-        self.surfaces = [_with_numerics(b, samples, integral) for b in bodies]
+        self.surfaces = [_with_numerics(b, samples, integral, diffuse) for b in bodies]
         boxes = [n.body.shape for n in nodes if isinstance(n.body.shape, Box)]
         self.half_size = _stack([b.half_size for b in boxes], (3,), self.device)
         is_box = torch.tensor([isinstance(n.body.shape, Box) for n in nodes], device=self.device)
@@ -227,17 +229,33 @@ class World:
         self, which: Int[Tensor, "m"], contact: Contact, frequency: Float[Tensor, "f"]
     ) -> Complex[Tensor, "m f 2"]:
         """Reflection coefficients (TE, TM) at contacts given in the world."""
+        out = _complex(which, frequency)
+        for body, i, mine in self._contacts_object(which, contact):
+            out = out.index_copy(0, i, body.reflection(mine, frequency).to(out.dtype))
+        return out
+
+    def diffuse(
+        self, which: Int[Tensor, "m"], contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "m f 2"]:
+        """Amplitudes (TE, TM) of what scatters at contacts given in the world; 0 where smooth."""
+        out = _complex(which, frequency)
+        for body, i, mine in self._contacts_object(which, contact):
+            if body.scattering is not None:
+                out = out.index_copy(0, i, body.diffuse(mine, frequency).to(out.dtype))
+        return out
+
+    def _contacts_object(
+        self, which: Tensor, contact: Contact
+    ) -> Iterator[tuple[Body, Tensor, Contact]]:
         local = Contact(
             self.point_object(which, contact.point),
             self.direction_object(which, contact.incoming),
             self.direction_object(which, contact.outgoing),
             self.direction_object(which, contact.normal),
         )
-        out = _complex(which, frequency)
         for body, i in self.surface_groups(which):
             mine = Contact(local.point[i], local.incoming[i], local.outgoing[i], local.normal[i])
-            out = out.index_copy(0, i, body.reflection(mine, frequency).to(out.dtype))
-        return out
+            yield body, i, mine
 
     def transmission(
         self, which: Int[Tensor, "m"], crossing: Crossing, frequency: Float[Tensor, "f"]
@@ -307,11 +325,11 @@ def _distinct(
     return things, torch.tensor(owner, dtype=torch.int64, device=device)
 
 
-def _with_numerics(body: Body, samples: int | None, integral: str) -> Body:
+def _with_numerics(body: Body, samples: int | None, integral: str, diffuse: bool) -> Body:
     refined = getattr(body.surface, "with_numerics", None)
     if refined is None or samples is None:
         return body
-    return Body(body.shape, refined(samples, integral))
+    return Body(body.shape, refined(samples, integral, diffuse))
 
 
 def _shape_key(body: Body) -> tuple[object, Shape | None]:

@@ -3,12 +3,16 @@
 Also ``Dielectric``, the medium that half-spaces and slabs are made of.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
 from rfsg.objects.contract import Contact, Crossing, Shape
 from rfsg.objects.physics import fresnel, media
+from rfsg.objects.physics.lobes import Scattering
 
 
 class Dielectric(nn.Module):
@@ -76,7 +80,47 @@ class Dielectric(nn.Module):
         )
 
 
-class _Opaque(nn.Module):
+class Known(nn.Module):
+    """What surfaces of known material share: a wave that they reflect may scatter in part.
+
+    ``scattering``: how, as a ``Scattering`` or its ``config``; None for a smooth surface. A surface
+    says in ``whole`` what it reflects in all; the mirror and the diffuse wave share its power, the
+    mirror always without the diffuse share, whether or not that is followed.
+    """
+
+    scattering: Scattering | None
+
+    def __init__(self, scattering: Scattering | Mapping[str, Any] | None = None):
+        super().__init__()
+        self.scattering = Scattering.of(scattering)
+
+    def whole(
+        self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """Reflection coefficients (TE, TM) of all that is reflected."""
+        raise NotImplementedError
+
+    def reflection(
+        self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """sqrt(1 - S^2) R: the mirror's share."""
+        whole = self.whole(shape, contact, frequency)
+        return whole if self.scattering is None else whole * self.scattering.mirror_amplitude()
+
+    def diffuse(
+        self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """S R: the amplitude of the diffuse wave in all directions together."""
+        whole = self.whole(shape, contact, frequency)
+        rough = self.scattering
+        return torch.zeros_like(whole) if rough is None else whole * rough.diffuse_amplitude()
+
+    def roughness(self) -> dict[str, Any]:
+        """The part of ``config`` that says how it scatters."""
+        return {} if self.scattering is None else {"scattering": self.scattering.config()}
+
+
+class _Opaque(Known):
     """What conductors and half-spaces share: nothing comes through."""
 
     opaque = True
@@ -103,11 +147,11 @@ class _Opaque(nn.Module):
 
 
 class Conductor(_Opaque):
-    """A perfect electric conductor: R_TE = R_TM = -1 at every angle and frequency."""
+    """A perfect electric conductor: R_TE = R_TM = -1 at every angle and frequency, where smooth."""
 
     kind = "conductor"
 
-    def reflection(
+    def whole(
         self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
     ) -> Complex[Tensor, "*b f 2"]:
         point = contact.point
@@ -119,7 +163,7 @@ class Conductor(_Opaque):
         )
 
     def config(self) -> dict:
-        return {}
+        return self.roughness()
 
 
 class DielectricHalfSpace(_Opaque):
@@ -136,11 +180,12 @@ class DielectricHalfSpace(_Opaque):
         eps_r: float | None = None,
         sigma: float | None = None,
         extrapolate: bool = False,
+        scattering: Scattering | Mapping[str, Any] | None = None,
     ):
-        super().__init__()
+        super().__init__(scattering)
         self.medium = Dielectric(itu, eps_r, sigma, extrapolate)
 
-    def reflection(
+    def whole(
         self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
     ) -> Complex[Tensor, "*b f 2"]:
         frequency = frequency.to(contact.point.device)
@@ -149,7 +194,7 @@ class DielectricHalfSpace(_Opaque):
         return r.to(contact.point.dtype.to_complex())
 
     def config(self) -> dict:
-        return self.medium.config()
+        return {**self.medium.config(), **self.roughness()}
 
 
 def contact_cosine(contact: Contact) -> Float[Tensor, "*b"]:

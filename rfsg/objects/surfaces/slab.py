@@ -1,20 +1,25 @@
 """A thin wall of known material: the single-layer slab of ITU-R P.2040-4, section 2.2.2."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from jaxtyping import Complex, Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from rfsg.objects.contract import Contact, Crossing, Shape
 from rfsg.objects.physics import fresnel
+from rfsg.objects.physics.lobes import Scattering
 from rfsg.objects.surfaces.interface import (
     Dielectric,
+    Known,
     at_boundary,
     contact_cosine,
     crossing_cosines,
 )
 
 
-class Slab(nn.Module):
+class Slab(Known):
     """A layer of ``thickness_m`` metres, reflecting and transmitting as a whole.
 
     The thickness is the wall's own, in physical metres, whatever shape and scale the object is
@@ -33,14 +38,15 @@ class Slab(nn.Module):
         eps_r: float | None = None,
         sigma: float | None = None,
         extrapolate: bool = False,
+        scattering: Scattering | Mapping[str, Any] | None = None,
     ):
-        super().__init__()
+        super().__init__(scattering)
         if not 0 < thickness_m < float("inf"):
             raise ValueError(f"slab: expected a thickness in metres > 0, got {thickness_m!r}")
         self.thickness_m = thickness_m
         self.medium = Dielectric(itu, eps_r, sigma, extrapolate)
 
-    def reflection(
+    def whole(
         self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
     ) -> Complex[Tensor, "*b f 2"]:
         """R of the slab, referred to its front face, at the mean of both directions' |cos|."""
@@ -71,7 +77,7 @@ class Slab(nn.Module):
         return delay[..., 0].to(crossing.start.dtype)
 
     def config(self) -> dict:
-        return {"thickness_m": self.thickness_m, **self.medium.config()}
+        return {"thickness_m": self.thickness_m, **self.medium.config(), **self.roughness()}
 
 
 def _mean_cosine(crossing: Crossing) -> Tensor:

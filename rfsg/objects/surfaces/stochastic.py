@@ -4,6 +4,9 @@ One scalar model for TE and TM, without dispersion. What the paper leaves open i
 R = exp(-a_out * interaction_length), so the gain of a reflection does not depend on a numerical
 step; phi in [-pi/2, pi/2] and Re a >= 0, so nothing amplifies; every boundary crossed carries
 sqrt(1 - |R|^2) ("conserving"), unless the paper's literal form is asked for ("paper").
+
+Where diffuse reflection is followed, the share 1 - alpha of |R|^2 leaves by Lambert's law and the
+mirror keeps sqrt(alpha) R. Where it is not, the mirror carries the whole of R, as in the paper.
 """
 
 import copy
@@ -18,6 +21,7 @@ from torch.nn.functional import linear
 
 from rfsg.objects.contract import Contact, Crossing, Shape
 from rfsg.objects.physics import transport
+from rfsg.objects.physics.lobes import Scattering, share_amplitude
 from rfsg.objects.surfaces.interface import (
     at_boundary,
     contact_cosine,
@@ -35,6 +39,7 @@ SATURATION = 40.0
 # sqrt(1 - |R|^2) has no slope at |R| = 1; below -120 dB it continues as a line.
 PASSED_POWER_FLOOR = 1e-12
 INTERFACES = ("conserving", "paper")
+_LAMBERT = Scattering(1.0)
 
 
 class Fields(NamedTuple):
@@ -70,6 +75,7 @@ class StochasticSurface(nn.Module):
 
     kind = "stochastic"
     opaque = False
+    splits = False  # whether the diffuse share is followed apart from the mirror's
 
     def __init__(
         self,
@@ -120,15 +126,19 @@ class StochasticSurface(nn.Module):
         """Length over which a reflection interacts with the object [m]."""
         return self.log_interaction_length.exp()
 
-    def with_numerics(self, samples: int, integral: str) -> "StochasticSurface":
+    def with_numerics(
+        self, samples: int, integral: str, diffuse: bool = False
+    ) -> "StochasticSurface":
         """The same surface (parameters shared) integrated with so many intervals, by that rule.
 
-        How finely a crossing is integrated is the asker's business, not the material's.
+        How finely a crossing is integrated is the asker's business, not the material's, and so is
+        whether the diffuse share is followed apart from the mirror's.
         """
         _require(integral in transport.INTEGRALS, "integral", integral, "telescoped or riemann")
         _require(samples >= 1, "samples", samples, "a number of intervals >= 1")
         other = copy.copy(self)
         other.samples, other.integral = samples, integral
+        other.splits = diffuse
         return other
 
     def config(self) -> dict:
@@ -151,13 +161,33 @@ class StochasticSurface(nn.Module):
     def reflection(
         self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
     ) -> Complex[Tensor, "*b f 2"]:
-        """R = exp(-a_out * interaction_length), the same for TE and TM.
+        """R = exp(-a_out * interaction_length), the same for TE and TM; sqrt(alpha) R where the
+        diffuse share is followed.
 
         A vertex a hair inside counts as on the boundary: a_out is taken at max(f, 0).
         """
+        whole, alpha = self._whole(shape, contact)
+        if self.splits:
+            whole = whole * share_amplitude(alpha)
+        return _expand(whole, frequency)
+
+    @property
+    def scattering(self) -> Scattering | None:
+        """Lambert's law for the share 1 - alpha, where that is followed."""
+        return _LAMBERT if self.splits else None
+
+    def diffuse(
+        self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "*b f 2"]:
+        """sqrt(1 - alpha) R: the amplitude of the diffuse wave in all directions together."""
+        whole, alpha = self._whole(shape, contact)
+        return _expand(whole * share_amplitude(1.0 - alpha), frequency)
+
+    def _whole(self, shape: Shape, contact: Contact) -> tuple[Tensor, Tensor]:
+        """R of all that is reflected, and alpha there."""
         at = self._sample(shape, contact.point)
         a = self._interaction(at, at.f.clamp(min=0.0), contact_cosine(contact))
-        return _expand((-a).exp(), frequency)
+        return (-a).exp(), at.fields.alpha
 
     def transmission(
         self, shape: Shape, crossing: Crossing, frequency: Float[Tensor, "f"]
