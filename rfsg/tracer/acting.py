@@ -4,7 +4,7 @@ A dyad maps the field before a vertex to the field after it, without spreading. 
 of an unpolarised link carries the mean power of the two polarisations and the phase of TE.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -83,18 +83,14 @@ def dyad_of(
     return pair[..., 0, None, None] * te[:, None] + pair[..., 1, None, None] * tm[:, None]
 
 
-def _reflection(at: Acting, i: Tensor, level: int) -> Complex[Tensor, "m f 2"]:
+def reflection(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f"]:
+    """Scalar coefficient of mirrors."""
     which, contact = at.contact(i, level)
-    return at.world.reflection(which, contact, at.frequency)
+    return scalar(at.world.reflection(which, contact, at.frequency))
 
 
-def _reflection_dyad(at: Acting, i: Tensor, level: int) -> Complex[Tensor, "m f 3 3"]:
-    _, contact = at.contact(i, level)
-    pair = _reflection(at, i, level)
+def reflection_dyad(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f 3 3"]:
+    """What mirrors do to world field vectors."""
+    which, contact = at.contact(i, level)
+    pair = at.world.reflection(which, contact, at.frequency)
     return dyad_of(pair, contact.incoming, contact.outgoing, contact.normal)
-
-
-Rule = Callable[[Acting, Tensor, int], Tensor]  # (at, rows of paths, level) -> [m f] or [m f 3 3]
-
-COEFFICIENT: dict[Act, Rule] = {Act.REFLECT: lambda at, i, k: scalar(_reflection(at, i, k))}
-DYAD: dict[Act, Rule] = {Act.REFLECT: _reflection_dyad}

@@ -22,11 +22,12 @@ from rfsg.objects.contract import Crossing
 from rfsg.scene.antennas import PATTERNS
 from rfsg.scene.radios import Radio
 from rfsg.scene.world import World, unit
-from rfsg.tracer.acting import COEFFICIENT, DYAD, Acting, dyad_of, scalar
+from rfsg.tracer.acting import Acting, dyad_of, scalar
 from rfsg.tracer.edges import Edges
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.march import EVALUATE, crossings
+from rfsg.tracer.mechanisms import COEFFICIENT, DYAD
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Channel, Crossings, Paths, Rays
 

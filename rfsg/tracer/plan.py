@@ -12,7 +12,9 @@ class Quality:
     depth: most reflections on a path.
     curved: most of them on curved or learned faces (each scatters a wave widely; two are weak).
     curved_depth: most reflections in all on a path that has a curved or learned face.
-    diffraction: most edges that a path bends round (0: none). diffuse: tiles per face and direction
+    diffraction: most edges that a path bends round: 0, 1 or 2.
+    diffraction_depth: most interactions in all on a path that bends round one edge.
+    diffuse: tiles per face and direction
         from which rough surfaces scatter (0: none). refraction: solids bend what goes through them.
     search: "auto" enumerates all sequences of faces where the scene is small enough (nothing can be
         missed) and launches rays elsewhere; "enumerate" or "rays" insist.
@@ -32,6 +34,7 @@ class Quality:
     curved: int = 1
     curved_depth: int = 2
     diffraction: int = 0
+    diffraction_depth: int = 2
     diffuse: int = 0
     refraction: bool = True
     search: str = "auto"

@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -13,8 +14,10 @@ from torch import Tensor
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
+from rfsg.tracer import diffraction
 from rfsg.tracer import field as fields
 from rfsg.tracer.channel import Link, links, transfer
+from rfsg.tracer.edges import edges_in
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.launch import SearchReport, search
@@ -90,6 +93,10 @@ def simulate(
             wavelength = SPEED_OF_LIGHT / float(frequencies[0])
             paths, counts = solve(world, chains, tx, rx, wavelength, quality)
             edges, found = None, [paths]
+            if quality.diffraction:
+                edges = edges_in(world, wavelength)
+                more, bent = diffraction.paths_of(world, edges, tx, rx, wavelength, quality)
+                found, counts = found + more, Counter(counts) + Counter(bent)
             paths = Paths.joined(found)
         with _timed(seconds, "field", tell):
             channel = fields.channel(

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from rfsg.scene.world import World, unit
 from rfsg.tracer import zone
+from rfsg.tracer.images import images_of, unfolded
 from rfsg.tracer.implicit import (
     caustics,
     kkt,
@@ -150,30 +151,17 @@ def _capped_inverse(length: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
 
 
 def _images(world: World, batch: Batch) -> Solved:
-    c, depth = batch.which.shape
-    planes = [world.plane(batch.which[:, i], batch.patch[:, i])[:2] for i in range(depth)]
-    images = [batch.tx]
-    for normal, offset in planes:
-        height = (images[-1] * normal).sum(-1) - offset
-        images.append(images[-1] - 2.0 * height[:, None] * normal)
-    target, vertices = batch.rx, []
-    for i in range(depth - 1, -1, -1):
-        normal, offset = planes[i]
-        ray = target - images[i + 1]
-        slope = (ray * normal).sum(-1)
-        parallel = slope == 0
-        t = (offset - (images[i + 1] * normal).sum(-1)) / torch.where(parallel, 1.0, slope)
-        target = images[i + 1] + t[:, None] * ray
-        vertices.insert(0, target)
-    x = torch.stack(vertices, 1)
-    normal = torch.stack([n for n, _ in planes], 1)
-    line = batch.rx - images[-1]
+    mirrors = [(batch.which[:, i], batch.patch[:, i]) for i in range(batch.which.shape[1])]
+    images = images_of(world, mirrors, batch.tx)
+    x = unfolded(images, batch.rx)
+    line = batch.rx - images.image
     square = (line * line).sum(-1)
     length = torch.sqrt(torch.where(square == 0, torch.ones_like(square), square))
     batch.x = x
-    status = _validate(world, batch, batch.polyline(x), normal, None)
+    status = _validate(world, batch, batch.polyline(x), images.normal, None)
     status = torch.where(square == 0, int(Status.DEGENERATE), status)
-    return Solved(batch.polyline(x), normal, 1.0 / length, torch.zeros_like(status), status)
+    none = torch.zeros_like(status)
+    return Solved(batch.polyline(x), images.normal, 1.0 / length, none, status)
 
 
 # anything else: Newton on the Lagrangian

@@ -1,0 +1,599 @@
+"""Edge diffraction: paths that bend round convex edges, and what an edge does to the wave.
+
+Keller's law is Fermat's: the point on an edge is where the length of the path is stationary along it.
+Planar mirrors before the first edge and after the last are unfolded into images of the two ends, so a
+path is a source, one or two edges, and a destination. With t the arc lengths of its edge points,
+
+    S = prod_i 1/s_i  prod_k sin(beta_k)  / sqrt|det H|,     H = d2L / dt2,
+
+s_i the stretches between ends and edges: the stationary phase of waves that every point of the edges
+sends out. For one straight edge it is 1 / sqrt(s s' (s + s')) (Kouyoumjian and Pathak 1974, Eq. 21);
+for two parallel ones 1 / sqrt(s0 s1 s2 (s0 + s1 + s2)); for a rim it holds the edge's own curvature.
+The rest of the field is the coefficient of ``objects.physics.utd``, in metres^(1/2) for each edge.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from torch import Tensor
+
+from rfsg.objects.contract import Contact, Crossing
+from rfsg.objects.physics import utd
+from rfsg.scene.world import World, unit
+from rfsg.tracer.acting import Acting, scalar
+from rfsg.tracer.edges import Edges, along_face, is_free
+from rfsg.tracer.faces import Planes, planes_of
+from rfsg.tracer.images import fold, images_of
+from rfsg.tracer.implicit import segments
+from rfsg.tracer.plan import Quality
+from rfsg.tracer.records import Act, Paths, Status
+from rfsg.tracer.sequences import Budget, Prefixes, TooMany, levels
+
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
+ROUNDS = 30  # Newton steps; the length is convex along straight edges
+SETTLED = 1e-12  # of the path's length: the last step of a converged edge point
+RIM_LOOKS = 90  # places round a rim at which stationary points are looked for
+SAME = 1e-9  # of the length: closer than this to an edge's end still belongs to it
+MOST_PAIRS = 20_000_000  # sources x edges x destinations that one scene may ask for
+
+
+@dataclass(frozen=True)
+class Bends:
+    """Candidate paths: mirrors before the edges, the edges with a first guess, mirrors after."""
+
+    tx: Int[Tensor, "c"]
+    rx: Int[Tensor, "c"]
+    fore: Int[Tensor, "c i"]  # rows of Planes, from the transmitter on
+    edge: Int[Tensor, "c k"]
+    t: Float[Tensor, "c k"]
+    aft: Int[Tensor, "c j"]  # rows of Planes, from the receiver back
+
+    def take(self, i: Tensor) -> "Bends":
+        return Bends(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
+
+
+def paths_of(
+    world: World,
+    edges: Edges,
+    tx: Float[Tensor, "t 3"],
+    rx: Float[Tensor, "r 3"],
+    wavelength: float,
+    quality: Quality,
+) -> tuple[list[Paths], dict[Status, int]]:
+    """Diffracted paths, and how many candidates ended in each status.
+
+    One edge with up to ``diffraction_depth - 1`` planar mirrors before and after it; with
+    ``diffraction=2`` also two straight edges and no mirror. Raises ValueError when the scene has more
+    combinations than ``MOST_PAIRS``. Differentiable in poses, sizes and positions.
+    """
+    planes = planes_of(world)
+    found: list[Paths] = []
+    counts: dict[Status, int] = {}
+    try:
+        some = [b for b in candidates(world, planes, edges, tx, rx, quality) if len(b.tx)]
+    except TooMany:
+        raise ValueError(
+            f"diffraction: {len(edges)} edges between {len(tx)} transmitters and {len(rx)} receivers "
+            "are too many; lower diffraction_depth or diffraction, or ask for fewer receivers"
+        ) from None
+    for bends in some:
+        paths = _exact(world, planes, edges, bends, tx, rx, wavelength)
+        for status, n in zip(*torch.unique(paths.status, return_counts=True), strict=True):
+            counts[Status(int(status))] = counts.get(Status(int(status)), 0) + int(n)
+        good = (paths.status == int(Status.OK)) | (paths.status == int(Status.CAUSTIC_CAPPED))
+        found.append(paths.take(torch.nonzero(good).squeeze(-1)))
+    return found, counts
+
+
+# the search: which mirrors and edges, without gradients
+
+
+@torch.no_grad()
+def candidates(
+    world: World, planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+) -> Iterator[Bends]:
+    """Every combination whose edge points lie on their edges, outside of their wedges."""
+    if not len(edges) or not quality.diffraction:
+        return
+    budget = Budget(MOST_PAIRS)
+    mirrors = max(0, min(quality.depth, quality.diffraction_depth) - 1)
+    ahead = [levels(planes, p, mirrors, budget) for p in tx]
+    behind = [levels(planes, p, mirrors, budget) for p in rx]
+    for i in range(mirrors + 1):
+        for j in range(mirrors + 1 - i):
+            fore, t = _stack([level[i] for level in ahead])
+            aft, r = _stack([level[j] for level in behind])
+            yield from _one_edge(edges, fore, t, aft, r, budget)
+    if quality.diffraction > 1:
+        yield from _two_edges(edges, tx, rx, budget)
+
+
+def _stack(parts: list[Prefixes]) -> tuple[Prefixes, Int[Tensor, "p"]]:
+    owner = [torch.full((len(p.image),), k, device=p.image.device) for k, p in enumerate(parts)]
+    whole = Prefixes(torch.cat([p.image for p in parts]), torch.cat([p.faces for p in parts]))
+    return whole, torch.cat(owner)
+
+
+def _one_edge(
+    edges: Edges, fore: Prefixes, t: Tensor, aft: Prefixes, r: Tensor, budget: Budget
+) -> Iterator[Bends]:
+    """Images at both ends of every edge: in closed form where it is straight, looked up on a rim."""
+    p, q = len(fore.image), len(aft.image)
+    budget.spend(p * q * len(edges))
+    for begin in range(0, len(edges), 64):
+        some = torch.arange(begin, min(len(edges), begin + 64), device=t.device)
+        own = edges.take(some)
+        for a in torch.arange(p, device=t.device).split(max(1, 2_000_000 // (64 * max(q, 1)))):
+            row, column, e, place = _stationary(own, fore.image[a], aft.image)
+            ahead = a[row]
+            yield Bends(
+                t[ahead], r[column], fore.faces[ahead], some[e][:, None], place[:, None],
+                aft.faces[column],
+            )  # fmt: skip
+
+
+def _stationary(edges: Edges, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(row of a, row of b, edge, t) of all stationary points that both ends see from outside."""
+    straight = torch.nonzero(edges.straight).squeeze(-1)
+    own = edges.take(straight)
+    za, ra, seen_a = _cylindrical(own, a)
+    zb, rb, seen_b = _cylindrical(own, b)
+    both = ra[:, None] + rb[None]
+    z = (za[:, None] * rb[None] + zb[None] * ra[:, None]) / both.clamp(min=1e-300)
+    slack = SAME * own.length
+    on = (z >= -slack) & (z <= own.length + slack) & seen_a[:, None] & seen_b[None] & (both > 0)
+    i, j, e = torch.nonzero(on, as_tuple=True)
+    found = [(i, j, straight[e], z[i, j, e])]
+    rims = torch.nonzero(~edges.straight).squeeze(-1)
+    if len(rims):
+        i, j, e, t = _on_rims(edges.take(rims), a, b)
+        found.append((i, j, rims[e], t))
+    i, j, e, t = (torch.cat(x) for x in zip(*found, strict=True))
+    return i, j, e, t
+
+
+def _cylindrical(edges: Edges, p: Float[Tensor, "p 3"]) -> tuple[Tensor, Tensor, Tensor]:
+    """Height along, distance from, and whether outside of, every straight edge [p e]."""
+    away = p[:, None] - edges.start[None]
+    z = (away * edges.along).sum(-1)
+    across = away - z[..., None] * edges.along
+    n, e = len(p), len(edges)
+    flat = edges.take(torch.arange(e, device=p.device).repeat(n))
+    turn = flat.angle(z.reshape(-1), across.reshape(-1, 3)).reshape(n, e)
+    return z, across.norm(dim=-1), _outside(edges, turn)
+
+
+def _outside(edges: Edges, turn: Tensor) -> Bool[Tensor, "*b"]:
+    """Angles within the exterior of their wedge; a hair below a face is on it."""
+    return (turn >= -GRAZING) & (turn <= math.pi * edges.opening + GRAZING)
+
+
+GRAZING = 1e-9  # [rad]
+
+
+def _on_rims(edges: Edges, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Where the slope of the length changes sign between looks around each rim."""
+    e = len(edges)
+    share = torch.arange(RIM_LOOKS, dtype=a.dtype, device=a.device) / RIM_LOOKS
+    look = edges.take(torch.arange(e, device=a.device).repeat_interleave(RIM_LOOKS))
+    t = (edges.length[:, None] * share).reshape(-1)
+    place, tangent, _ = look.point(t)
+    pull = [
+        (unit(place[None] - end[:, None]) * tangent).sum(-1).reshape(-1, e, RIM_LOOKS)
+        for end in (a, b)
+    ]
+    slope = pull[0][:, None] + pull[1][None]
+    following = slope.roll(-1, -1)
+    turns = (slope == 0) | (slope * following < 0)
+    i, j, k, s = torch.nonzero(turns, as_tuple=True)
+    here, after = slope[i, j, k, s], following[i, j, k, s]
+    gone = here / torch.where(here == after, torch.ones_like(here), here - after)
+    return i, j, k, edges.length[k] * (share[s] + gone / RIM_LOOKS)
+
+
+def _two_edges(edges: Edges, tx: Tensor, rx: Tensor, budget: Budget) -> Iterator[Bends]:
+    """Ordered pairs of straight edges: those of one object share a face, those of two may be any."""
+    straight = torch.nonzero(edges.straight).squeeze(-1)
+    own = edges.take(straight)
+    seen = [_cylindrical(own, end)[2] for end in (tx, rx)]
+    share = torch.zeros(len(own), len(own), dtype=torch.bool, device=tx.device)
+    for first in (own.patch0, own.patch1):
+        for second in (own.patch0, own.patch1):
+            share |= first[:, None] == second[None]
+    pairs = (own.node[:, None] != own.node[None]) | share
+    pairs.fill_diagonal_(False)
+    budget.spend(len(tx) * len(rx) * int(pairs.sum()))
+    for t in range(len(tx)):
+        for r in range(len(rx)):
+            a, b = torch.nonzero(pairs & seen[0][t][:, None] & seen[1][r][None], as_tuple=True)
+            edge = torch.stack([straight[a], straight[b]], 1)
+            none = torch.zeros(len(a), 0, dtype=torch.int64, device=tx.device)
+            ends = (torch.full_like(a, t), torch.full_like(a, r))
+            middle = 0.5 * edges.length[edge]
+            yield Bends(*ends, none, edge, middle, none)
+
+
+# the exact path, with gradients
+
+
+def _exact(
+    world: World,
+    planes: Planes,
+    edges: Edges,
+    bends: Bends,
+    tx: Tensor,
+    rx: Tensor,
+    wavelength: float,
+) -> Paths:
+    fore = [(planes.node[f], planes.patch[f]) for f in bends.fore.unbind(1)]
+    aft = [(planes.node[f], planes.patch[f]) for f in bends.aft.unbind(1)]
+    before = images_of(world, fore, tx[bends.tx])
+    behind = images_of(world, aft, rx[bends.rx])
+    some = edges.take(bends.edge.reshape(-1))
+    c, k = bends.edge.shape
+    with torch.no_grad():
+        t, settled = _newton(some, bends.t, before.image, behind.image)
+    t = _implicit_step(some, t, before.image, behind.image)
+    line = _Line(some, t, before.image, behind.image)
+    first, first_on = fold(world, before, fore, line.place[:, 0])
+    last, last_on = fold(world, behind, aft, line.place[:, -1])
+    ends = tx[bends.tx][:, None], rx[bends.rx][:, None]
+    vertices = torch.cat([ends[0], first, line.place, last.flip(1), ends[1]], 1)
+    hessian, sine = line.hessian, line.sine
+    floor = wavelength / some.length.reshape(c, k).amin(1) ** 2
+    bent, capped, caustics = _held(hessian, floor)
+    spread = sine.prod(1) / (line.length.clamp(min=1e-300).prod(1) * bent)
+    which = torch.cat(
+        [_column(fore, 0, c, some), some.node.reshape(c, k), _column(aft, 0, c, some).flip(1)], 1
+    )
+    item = torch.cat([_column(fore, 1, c, some), bends.edge, _column(aft, 1, c, some).flip(1)], 1)
+    act = torch.zeros_like(which)
+    act[:, len(fore) : len(fore) + k] = int(Act.DIFFRACT)
+    normal0, normal1 = some.normals(t.reshape(-1))
+    middle = unit(normal0 + normal1).reshape(c, k, 3)
+    normal = torch.cat([before.normal, middle, behind.normal.flip(1)], 1)
+    length = segments(vertices)[0]
+    with torch.no_grad():
+        status = torch.where(capped, int(Status.CAUSTIC_CAPPED), int(Status.OK))
+        free = is_free(world, some, t.reshape(-1), wavelength).reshape(c, k).all(1)
+        inside = line.within() & first_on & last_on & free
+        status = torch.where(inside, status, int(Status.OFF_SURFACE))
+        status = torch.where(settled, status, int(Status.NOT_CONVERGED))
+        degenerate = (length <= 0).any(1) | (sine <= 0).any(1) | ~torch.isfinite(spread)
+        status = torch.where(degenerate, int(Status.DEGENERATE), status)
+    return Paths(
+        bends.tx, bends.rx, which, act, item, vertices, normal, length.sum(1), spread,
+        caustics, status,
+    )  # fmt: skip
+
+
+def _column(faces: list[tuple[Tensor, Tensor]], k: int, c: int, some: Edges) -> Tensor:
+    none = torch.zeros(c, 0, dtype=torch.int64, device=some.node.device)
+    return torch.stack([f[k] for f in faces], 1) if faces else none
+
+
+class _Line:
+    """Source, edge points, destination at given arc lengths: lengths, slope and Hessian of L(t)."""
+
+    def __init__(self, some: Edges, t: Tensor, a: Tensor, b: Tensor):
+        c, k = t.shape
+        self.some, self.t = some, t
+        place, tangent, bend = (x.reshape(c, k, 3) for x in some.point(t.reshape(-1)))
+        self.place, self.tangent = place, tangent
+        self.length, self.u = segments(torch.cat([a[:, None], place, b[:, None]], 1))
+        turn = self.u[:, :-1] - self.u[:, 1:]
+        self.slope = (turn * tangent).sum(-1)
+        # |u x p'|^2: what a step along the edge moves across a segment
+        before = (self.u[:, :-1] * tangent).sum(-1)
+        after = (self.u[:, 1:] * tangent).sum(-1)
+        inverse = 1.0 / self.length.clamp(min=1e-300)
+        h = torch.zeros(c, k, k, dtype=t.dtype, device=t.device)
+        diagonal = (
+            (1 - before**2) * inverse[:, :-1]
+            + (1 - after**2) * inverse[:, 1:]
+            + (turn * bend).sum(-1)
+        )
+        h = h + torch.diag_embed(diagonal)
+        if k == 2:
+            mixed = (tangent[:, 0] * tangent[:, 1]).sum(-1) - after[:, 0] * before[:, 1]
+            swap = torch.tensor([[0.0, 1.0], [1.0, 0.0]], dtype=t.dtype, device=t.device)
+            h = h - (mixed * inverse[:, 1])[:, None, None] * swap
+        self.hessian = h
+        self.sine = torch.linalg.cross(self.u[:, :-1], tangent).norm(dim=-1)
+
+    def within(self) -> Bool[Tensor, "c"]:
+        """Edge points on their edges, met and left from outside of their wedges."""
+        c, k = self.t.shape
+        length = self.some.length.reshape(c, k)
+        slack = SAME * length
+        rim = ~self.some.straight.reshape(c, k)
+        on = ((self.t >= -slack) & (self.t <= length + slack)) | rim
+        flat = self.t.reshape(-1)
+        for away in (-self.u[:, :-1], self.u[:, 1:]):
+            turn = self.some.angle(flat, away.reshape(-1, 3))
+            on &= _outside(self.some, turn).reshape(c, k)
+        return on.all(1)
+
+
+def _newton(some: Edges, t: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Bool[Tensor, "c"]]:
+    settled = torch.zeros(len(t), dtype=torch.bool, device=t.device)
+    for _ in range(ROUNDS):
+        line = _Line(some, t, a, b)
+        step = _solve(line.hessian, line.slope)
+        reach = torch.minimum(line.length[:, :-1], line.length[:, 1:]).amin(1, keepdim=True)
+        step = torch.maximum(torch.minimum(step, reach), -reach)
+        t = t - step
+        total = line.length.sum(1, keepdim=True)
+        rounding = 64 * 2.0**-52 * line.place.abs().amax((1, 2))
+        settled = step.abs().amax(1) <= SETTLED * total[:, 0] + rounding
+        if bool(settled.all()):
+            break
+    return t, settled
+
+
+def _implicit_step(some: Edges, t: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """The same arc lengths, now carrying gradients: t - H^-1 dL/dt with H held fixed."""
+    line = _Line(some, t, a, b)
+    return t - _solve(line.hessian.detach(), line.slope)
+
+
+def _solve(hessian: Float[Tensor, "c k k"], right: Float[Tensor, "c k"]) -> Float[Tensor, "c k"]:
+    if hessian.shape[1] == 1:
+        h = hessian[:, :, 0]
+        return torch.where(h == 0, torch.zeros_like(right), right / torch.where(h == 0, 1.0, h))
+    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
+    safe = torch.where(det == 0, torch.ones_like(det), det)
+    first = (hessian[:, 1, 1] * right[:, 0] - hessian[:, 0, 1] * right[:, 1]) / safe
+    second = (hessian[:, 0, 0] * right[:, 1] - hessian[:, 0, 1] * right[:, 0]) / safe
+    return torch.where(det[:, None] == 0, 0.0, torch.stack([first, second], 1))
+
+
+def _held(
+    hessian: Float[Tensor, "c k k"], floor: Float[Tensor, "c"]
+) -> tuple[Tensor, Bool[Tensor, "c"], Int[Tensor, "c"]]:
+    """sqrt|det H|, which were held, and how many directions are maxima (caustics passed).
+
+    No bend below lambda / length^2: the stretch of an edge that acts is never longer than the edge.
+    """
+    if hessian.shape[1] == 1:
+        bend = hessian[:, 0, 0]
+        capped = bend.abs() < floor
+        return (
+            torch.sqrt(torch.where(capped, floor, bend.abs())),
+            capped,
+            ((bend < 0) & ~capped).long(),
+        )
+    det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
+    capped = det <= floor**2
+    down = torch.linalg.eigvalsh(hessian.detach()) < 0
+    return torch.sqrt(torch.where(capped, floor**2, det)), capped, (down & ~capped[:, None]).sum(1)
+
+
+# what an edge does to the wave
+#
+# World vectors stand in the edge's own frame at each ray, phi-hat towards growing azimuth and beta-hat
+# = u x phi-hat, where a wave is (soft, hard). With W the 2 x 2 sum of utd's terms and their weights,
+# E_out = -B_out W B_in^T E_in. A face's (TE, TM) are turned into that frame by the angle between its
+# plane of incidence and the edge-fixed plane, the mean of both rays': exact on the boundary where the
+# term belongs to a ray, the same from both ends, and no turn at all for a conductor.
+
+
+@dataclass(frozen=True)
+class _Wedge:
+    """An edge at a level of some paths, as utd asks it; s are to the next edge or the path's end."""
+
+    edges: Edges
+    point: Float[Tensor, "m 3"]
+    tangent: Float[Tensor, "m 3"]
+    normal0: Float[Tensor, "m 3"]
+    normal1: Float[Tensor, "m 3"]
+    u_in: Float[Tensor, "m 3"]
+    u_out: Float[Tensor, "m 3"]
+    phi_in: Float[Tensor, "m"]
+    phi_out: Float[Tensor, "m"]
+    beta: Float[Tensor, "m"]
+    s_in: Float[Tensor, "m"]
+    s_out: Float[Tensor, "m"]
+
+    def take(self, i: Tensor) -> "_Wedge":
+        rest = (getattr(self, n)[i] for n in list(_Wedge.__dataclass_fields__)[1:])
+        return _Wedge(self.edges.take(i), *rest)
+
+    def frame(self, away: Float[Tensor, "m 3"], u: Float[Tensor, "m 3"]) -> Float[Tensor, "m 3 2"]:
+        """Columns beta-hat and phi-hat of a ray that travels along u, ``away`` from the edge or to it."""
+        # azimuth grows from face 0 towards its normal
+        axis = torch.linalg.cross(along_face(self.normal0, self.normal1), self.normal0)
+        phi = unit(torch.linalg.cross(axis, away))
+        return torch.stack([torch.linalg.cross(u, phi), phi], -1)
+
+
+def _wedge(at: Acting, i: Tensor, level: int, alone: Bool[Tensor, "m"]) -> _Wedge:
+    assert at.edges is not None
+    edges = at.edges.take(at.paths.item[i, level])
+    point = at.paths.vertices[i, level + 1]
+    t = edges.arc_length(point)
+    _, tangent, _ = edges.point(t)
+    normal0, normal1 = edges.normals(t)
+    u_in, u_out = at.u[i, level], at.u[i, level + 1]
+    length = segments(at.paths.vertices[i])[0]
+    s_in = torch.where(alone, length[:, : level + 1].sum(1), length[:, level])
+    s_out = torch.where(alone, length[:, level + 1 :].sum(1), length[:, level + 1])
+    across = [u - (u * tangent).sum(-1, keepdim=True) * tangent for u in (-u_in, u_out)]
+    sine = 0.5 * (across[0].norm(dim=-1) + across[1].norm(dim=-1))
+    cosine = 0.5 * ((u_in + u_out) * tangent).sum(-1)
+    phi_in, phi_out = (edges.angle(t, a) for a in across)
+    beta = torch.atan2(sine, cosine)
+    return _Wedge(
+        edges, point, tangent, normal0, normal1, u_in, u_out, phi_in, phi_out, beta, s_in, s_out
+    )  # fmt: skip
+
+
+Weights = tuple[Tensor, Tensor, Tensor]  # R of face 0, R of face n, T: each [m f 2 2]
+
+
+def _weights(at: Acting, which: Tensor, w: _Wedge, polarised: bool) -> Weights:
+    """What both faces reflect, and what the direct ray keeps through the wedge, in the edge's frame.
+
+    Unpolarised, each is the link's scalar coefficient times the unit matrix: only then do diffracted,
+    direct and reflected scalar waves add up to a field without steps.
+    """
+    ahead = unit(w.u_in + w.u_out)
+    reflected = []
+    for normal in (w.normal0, w.normal1):
+        c_in, c_out = (w.u_in * normal).sum(-1).abs(), (w.u_out * normal).sum(-1).abs()
+        cosine = utd.mean_cosine(c_in, c_out, w.s_in, w.s_out).clamp(max=1.0)[:, None]
+        slide = unit(ahead - (ahead * normal).sum(-1, keepdim=True) * normal)
+        slide = torch.sqrt((1.0 - cosine**2).clamp(min=1e-24)) * slide
+        contact = Contact(w.point, slide - cosine * normal, slide + cosine * normal, normal)
+        pair = at.world.reflection(which, contact, at.frequency)
+        reflected.append(
+            _turned(torch.stack([pair[..., 0], -pair[..., 1]], -1), _face_turn(w, normal), False)
+            if polarised
+            else _both(pair)
+        )
+    enters0 = ((ahead * w.normal0).sum(-1) < (ahead * w.normal1).sum(-1))[:, None]
+    enter, leave = (
+        torch.where(enters0, w.normal0, w.normal1),
+        torch.where(enters0, w.normal1, w.normal0),
+    )
+    step = 1e-6 * torch.minimum(w.s_in, w.s_out)[:, None] * ahead
+    corner = Crossing(w.point - step, w.point + step, enter, leave)
+    pair = at.world.transmission(which, corner, at.frequency)
+    turn = _angle_between(w.frame(ahead, ahead), ahead, unit(enter - leave))
+    return reflected[0], reflected[1], _turned(pair, turn, True) if polarised else _both(pair)
+
+
+def _both(pair: Complex[Tensor, "m f 2"]) -> Complex[Tensor, "m f 2 2"]:
+    return torch.diag_embed(scalar(pair)[..., None].expand(*pair.shape))
+
+
+def _face_turn(w: _Wedge, normal: Tensor) -> Float[Tensor, "m"]:
+    """Angle from the edge's frame to a face's plane of incidence, the two rays' mean.
+
+    The outgoing ray's is counted the other way about: on the boundary it is the incoming one's image.
+    """
+    turn_in = _angle_between(w.frame(-w.u_in, w.u_in), w.u_in, normal)
+    turn_out = -_angle_between(w.frame(w.u_out, w.u_out), w.u_out, normal)
+    # angles of planes: a difference of pi is none
+    gap = turn_out - turn_in
+    gap = gap - math.pi * torch.round(gap / math.pi).detach()
+    share = w.s_in / (w.s_in + w.s_out)  # weighted like the cosines, by its own distance
+    return turn_in + (1.0 - share) * gap
+
+
+def _angle_between(
+    frame: Float[Tensor, "m 3 2"], u: Float[Tensor, "m 3"], normal: Float[Tensor, "m 3"]
+) -> Float[Tensor, "m"]:
+    """Angle from (beta, phi) to (TE, TM) of a plane of incidence; 0 where that has no direction."""
+    te = torch.linalg.cross(u, normal)
+    soft, hard = (te * frame[..., 0]).sum(-1), (te * frame[..., 1]).sum(-1)
+    none = soft**2 + hard**2 < 1e-20
+    return torch.atan2(
+        torch.where(none, torch.zeros_like(hard), hard), torch.where(none, 1.0, soft)
+    )
+
+
+def _turned(
+    pair: Complex[Tensor, "m f 2"], turn: Float[Tensor, "m"], through: bool
+) -> Complex[Tensor, "m f 2 2"]:
+    """diag(pair) of a plane of incidence in the edge's frame; a reflection turns back the other way."""
+    cosine, sine = torch.cos(turn), torch.sin(turn)
+    into = torch.stack([cosine, sine, -sine, cosine], -1).reshape(-1, 1, 2, 2).to(pair.dtype)
+    out = into.mT if through else into
+    return out @ torch.diag_embed(pair) @ into
+
+
+def _summed(terms: Complex[Tensor, "m f 4"], weights: Weights) -> Complex[Tensor, "m f 2 2"]:
+    reflection0, reflection1, kept = weights
+    eye = torch.eye(2, dtype=terms.dtype, device=terms.device)
+    direct = (terms[..., 0] + terms[..., 1])[..., None, None]
+    return (
+        direct * (eye - kept)
+        + terms[..., 2, None, None] * reflection0
+        + terms[..., 3, None, None] * reflection1
+    )
+
+
+def _arguments(at: Acting, w: _Wedge, back: bool = False) -> tuple[Tensor, ...]:
+    """What utd's functions take, from the transmitter's side or from the receiver's."""
+    k = 2.0 * math.pi * at.frequency[None] / SPEED_OF_LIGHT
+    phi, s = (w.phi_in, w.phi_out), (w.s_in, w.s_out)
+    if back:
+        phi, s = phi[::-1], s[::-1]
+    return (*(x[:, None] for x in (*phi, w.beta, w.edges.opening, *s)), k)
+
+
+def _acts(
+    at: Acting, i: Tensor, level: int, polarised: bool
+) -> tuple[_Wedge, Complex[Tensor, "m f 2 2"]]:
+    """W [sqrt(m)] of edges at a level. Of two edges of one object, the second answers for both."""
+    before, after = _diffracts(at, i, level - 1), _diffracts(at, i, level + 1)
+    w = _wedge(at, i, level, ~(before | after))
+    which = at.paths.which[i, level]
+    weights = _weights(at, which, w, polarised)
+    own = _summed(utd.wedge_terms(*_arguments(at, w)), weights)
+    if level + 1 < at.paths.which.shape[1]:
+        first = after & (at.paths.which[i, level + 1] == which)
+        eye = torch.eye(2, dtype=own.dtype, device=own.device)
+        own = torch.where(first[:, None, None, None], eye, own)
+    j = torch.nonzero(before & (at.paths.which[i, max(level - 1, 0)] == which)).squeeze(-1)
+    if len(j):
+        those = (weights[0][j], weights[1][j], weights[2][j])
+        pair = _pair(at, i[j], level, w.take(j), own[j], those, polarised)
+        own = own.index_copy(0, j, pair)
+    return w, own
+
+
+def _diffracts(at: Acting, i: Tensor, level: int) -> Bool[Tensor, "m"]:
+    if not 0 <= level < at.paths.which.shape[1]:
+        return torch.zeros_like(i, dtype=torch.bool)
+    return (at.paths.which[i, level] >= 0) & (at.paths.act[i, level] == int(Act.DIFFRACT))
+
+
+def _pair(
+    at: Acting,
+    i: Tensor,
+    level: int,
+    second: _Wedge,
+    w2: Tensor,
+    weights2: Weights,
+    polarised: bool,
+) -> Complex[Tensor, "m f 2 2"]:
+    """Two edges of one face: W_2 W_1 / 2 and the slopes' share (utd.along_face, with matrices)."""
+    first = _wedge(at, i, level - 1, torch.zeros_like(i, dtype=torch.bool))
+    weights1 = _weights(at, at.paths.which[i, level - 1], first, polarised)
+    w1 = _summed(utd.wedge_terms(*_arguments(at, first)), weights1)
+    # azimuths from the common face at both edges: from face 0, or to face n
+    sign = _from_face(first, first.phi_out) * _from_face(second, second.phi_in)
+    slope1 = _summed(utd.slope_terms(*_arguments(at, first, back=True)), weights1)
+    slope2 = _summed(utd.slope_terms(*_arguments(at, second)), weights2)
+    # from the first edge's frame to the second's: the ray is one and the face is one, so but for signs
+    between = -second.frame(-second.u_in, second.u_in).mT @ first.frame(first.u_out, first.u_out)
+    between = between[:, None].to(w1.dtype)
+    w1, slope1 = (between @ x @ between.mT for x in (w1, slope1))
+    k = 2.0 * math.pi * at.frequency[None] / SPEED_OF_LIGHT
+    reach = (first.s_out * torch.sin(first.beta) * torch.sin(second.beta))[:, None] * k
+    slopes = -1j * (sign[:, None] / reach)[..., None, None] * (slope2 @ slope1)
+    return 0.5 * (w2 @ w1 + slopes)
+
+
+def _from_face(w: _Wedge, phi: Tensor) -> Tensor:
+    """+1 where a grazing azimuth lies at face 0, -1 at face n."""
+    near0 = phi < 0.5 * math.pi * w.edges.opening
+    return torch.where(near0, torch.ones_like(phi), -torch.ones_like(phi))
+
+
+def coefficient(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f"]:
+    """Of an unpolarised link: with the scalar coefficients of the faces; on metal the soft wave's."""
+    return _acts(at, i, level, False)[1][..., 0, 0]
+
+
+def dyad(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f 3 3"]:
+    """What edges do to world field vectors: -B_out W B_in^T."""
+    w, own = _acts(at, i, level, True)
+    b_in, b_out = w.frame(-w.u_in, w.u_in), w.frame(w.u_out, w.u_out)
+    b_in, b_out = b_in[:, None].to(own.dtype), b_out[:, None].to(own.dtype)
+    return -(b_out @ own @ b_in.mT)

@@ -1,0 +1,20 @@
+"""The one table of what happens at a vertex: for each ``Act``, a coefficient and a dyad."""
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+from rfsg.tracer import acting, diffraction
+from rfsg.tracer.acting import Acting
+from rfsg.tracer.records import Act
+
+Rule = Callable[[Acting, Tensor, int], Tensor]  # (at, rows of paths, level) -> [m f] or [m f 3 3]
+
+COEFFICIENT: dict[Act, Rule] = {
+    Act.REFLECT: acting.reflection,
+    Act.DIFFRACT: diffraction.coefficient,
+}
+DYAD: dict[Act, Rule] = {
+    Act.REFLECT: acting.reflection_dyad,
+    Act.DIFFRACT: diffraction.dyad,
+}
