@@ -582,7 +582,8 @@ class _Reader:
     def _pattern(self, prim: Usd.Prim) -> Pattern | None:
         """The measured pattern of a radio, read once for all radios with the same file."""
         where = str(prim.GetPath())
-        if not prim.GetAttribute(PATTERN_FILE).Get():
+        said = prim.GetAttribute(PATTERN_FILE).Get()
+        if not (said.path if isinstance(said, Sdf.AssetPath) else said):
             return None
         resolved, given = _asset_path(prim, PATTERN_FILE, self.roots, where)
         if resolved not in self.patterns:
