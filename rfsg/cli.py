@@ -506,11 +506,12 @@ def _print_links(result: Any) -> None:
         typer.echo(f"... and {len(rows) - most} more in links.csv")
 
 
-def _radio_row(role: str, radio: Any) -> dict[str, str]:
+def _radio_row(role: str, radio: Any) -> dict[str, Any]:
     place = " ".join(f"{x:.3g}" for x in radio.position.tolist())
     power = f"{radio.power_dbm:g}" if role == "transmitter" else ""
     row = {"path": radio.path, "role": role, "at [m]": place, "power [dBm]": power}
-    return row | {"pattern": radio.pattern, "polarization": radio.polarization}
+    array = "" if radio.array is None else radio.array
+    return row | {"pattern": radio.pattern, "polarization": radio.polarization, "array": array}
 
 
 def _print_files(out: Path, names: tuple[str, ...]) -> None:
