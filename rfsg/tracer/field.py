@@ -19,8 +19,7 @@ from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Crossing
-from rfsg.scene.antennas import PATTERNS
-from rfsg.scene.radios import Radio
+from rfsg.scene.radios import Radio, amplitude, field_components
 from rfsg.scene.world import World, unit
 from rfsg.tracer.acting import Acting, dyad_of, scalar
 from rfsg.tracer.edges import Edges
@@ -318,17 +317,12 @@ def _between_ports(
 def _components(
     radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
 ) -> Complex[Tensor, "p 2"]:
-    """(theta, phi) components of each path's radio along a world direction, pattern included.
-
-    "none" beside a polarised radio is taken as V.
-    """
+    """(theta, phi) field of each path's radio, its first port, along a world direction."""
     out = torch.zeros(len(index), 2, dtype=torch.complex128, device=direction.device)
     for r in torch.unique(index).tolist():
         i = torch.nonzero(index == r).squeeze(-1)
         local = direction[i] @ radios[r].rotation.to(direction)
-        gain = PATTERNS[radios[r].pattern](local).to(out.dtype)
-        unit_vector = [0.0, 1.0] if radios[r].polarization == "H" else [1.0, 0.0]
-        out = out.index_copy(0, i, gain[:, None] * gain.new_tensor(unit_vector))
+        out = out.index_copy(0, i, field_components(radios[r], local)[:, 0])
     return out
 
 
@@ -343,7 +337,7 @@ def _patterns(
     for r in set(torch.unique(index).tolist()) - plain:
         i = torch.nonzero(index == r).squeeze(-1)
         local = direction[i] @ radios[r].rotation.to(direction)
-        out = out.index_copy(0, i, PATTERNS[radios[r].pattern](local))
+        out = out.index_copy(0, i, amplitude(radios[r], local))
     return out
 
 
