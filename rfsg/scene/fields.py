@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
+from rfsg.objects.physics.lobes import LOBES
 from rfsg.scene.antennas import PATTERNS, POLARIZATIONS
 from rfsg.scene.arrays import MAX_ELEMENTS, UNITS
 from rfsg.scene.materials import MODELS
@@ -63,6 +64,12 @@ MATERIAL = (
     Field("rfsg:material:sigma", "double"),
     Field("rfsg:material:thickness", "double", positive=True),
     Field("rfsg:material:extrapolate", "bool", fallback=False),
+    Field("rfsg:material:scattering", "double"),
+    Field("rfsg:material:lobe", "token", tokens=tuple(LOBES)),
+    Field("rfsg:material:alphaR", "int"),
+    Field("rfsg:material:alphaI", "int"),
+    Field("rfsg:material:forwardShare", "double"),
+    Field("rfsg:material:crossShare", "double"),
 )
 RADIO = (
     Field("rfsg:radio:role", "token", tokens=("tx", "rx")),

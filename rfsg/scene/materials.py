@@ -7,6 +7,7 @@ from rfsg.objects.catalogue import surface_class
 
 MODELS = ("conductor", "halfspace", "slab", "stochastic")
 CONSTANTS = ("halfspace", "slab")  # the models that take permittivity and conductivity
+SCATTERING = ("scattering", "lobe", "alpha_r", "alpha_i", "forward_share", "cross_share")
 
 # linear base colour and opacity of the preview surface, by ITU name or model
 LOOKS = {
@@ -24,7 +25,9 @@ PLAIN_LOOK = ((0.5, 0.5, 0.5), 1.0)
 class Material:
     """What a prim says of its material: a model and, for halfspace and slab, either an ITU-R P.2040
     name or a relative permittivity and a conductivity [S/m]; thickness [m] for slab. extrapolate:
-    whether the ITU formula may be used outside its bands."""
+    whether the ITU formula may be used outside its bands. scattering and what follows: how a rough
+    one scatters, as ``rfsg.objects.physics.lobes.Scattering`` takes it; the lobe is Lambertian where
+    none is named."""
 
     model: str
     itu: str | None = None
@@ -32,9 +35,20 @@ class Material:
     sigma: float | None = None
     thickness: float | None = None
     extrapolate: bool = False
+    scattering: float | None = None
+    lobe: str | None = None
+    alpha_r: int | None = None
+    alpha_i: int | None = None
+    forward_share: float | None = None
+    cross_share: float | None = None
 
     def faults(self) -> list[str]:
         """What contradicts itself or is missing, thickness aside."""
+        given = [n for n in SCATTERING if getattr(self, n) is not None]
+        if given and self.model == "stochastic":
+            return [f"model stochastic takes no {', '.join(given)}: alpha says what scatters"]
+        if given and self.scattering is None:
+            return [f"{', '.join(given)} without scattering"]
         if self.model not in CONSTANTS:
             names = ("itu", "eps_r", "sigma", "thickness")
             given = [n for n in names if getattr(self, n) is not None]
@@ -55,6 +69,10 @@ class Material:
             arguments = {name: getattr(self, name) for name in names}
         if self.model == "slab":
             arguments["thickness_m"] = self.thickness
+        if self.scattering is not None:
+            rough = {name: getattr(self, name) for name in SCATTERING[1:]}
+            given = {name: value for name, value in rough.items() if value is not None}
+            arguments["scattering"] = {"coefficient": self.scattering, **given}
         return surface_class(self.model)(**arguments)
 
     def look(self) -> tuple[tuple[float, float, float], float]:
@@ -66,6 +84,7 @@ def material_of(surface: Any) -> Material | None:
     if surface.kind not in MODELS or surface.kind == "stochastic":
         return None
     config = surface.config()
+    rough = dict(config.get("scattering", {}))
     material = Material(
         surface.kind,
         config.get("itu"),
@@ -73,5 +92,7 @@ def material_of(surface: Any) -> Material | None:
         config.get("sigma"),
         config.get("thickness_m"),
         config.get("extrapolate", False),
+        rough.pop("coefficient", None),
+        **rough,
     )
     return material if material.surface().config() == config else None

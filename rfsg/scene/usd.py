@@ -17,7 +17,7 @@ import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -710,8 +710,7 @@ class _Reader:
                     )  # fmt: skip
                 return None
             prim, at = at, _spec(at)
-        model, itu, eps_r, sigma, thickness, extrapolate = self._values(prim, *MATERIAL).values()
-        material = Material(model, itu, eps_r, sigma, thickness, extrapolate)
+        material = Material(*self._values(prim, *MATERIAL).values())
         if faults := material.faults():
             raise SceneError([f"{prim.GetPath()}: {fault}" for fault in faults])
         return str(at.GetPath()), material
@@ -1266,15 +1265,8 @@ def _author(prim: Usd.Prim, values: Mapping[Field, Any], api: str | None = None)
 
 def _define_material(stage: Usd.Stage, path: str, material: Material) -> UsdShade.Material:
     look = UsdShade.Material.Define(stage, path)
-    values = (
-        material.model,
-        material.itu,
-        material.eps_r,
-        material.sigma,
-        material.thickness,
-        material.extrapolate,
-    )
-    _author(look.GetPrim(), dict(zip(MATERIAL, values, strict=True)), MATERIAL_API)
+    values = dict(zip(MATERIAL, astuple(material), strict=True))
+    _author(look.GetPrim(), values, MATERIAL_API)
     color, opacity = material.look()
     shader = UsdShade.Shader.Define(stage, f"{path}/Preview")
     shader.CreateIdAttr("UsdPreviewSurface")
