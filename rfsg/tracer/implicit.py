@@ -7,6 +7,13 @@ theorem gives the mixed second derivative of the path length,
 and M restricted to the planes across departure and arrival gives the spreading S = sqrt|det M| [1/m]:
 1/length for planar mirrors, the divergence factor of geometrical optics for curved ones. S is
 symmetric in transmitter and receiver by construction.
+
+A path that is refracted is stationary in its optical length: L = sum n_i |x_{i+1} - x_i|, with n_i
+the ``index`` of what segment i runs in. -dL/dx_tx = n_tx u_tx, so M = -d(n_tx u_tx)/dx_rx, and a
+solid angle at the transmitter spreads over dA / dOmega = n_tx^2 / |det M| at the receiver: with both
+ends in free space S = sqrt|det M| as before, whatever lies between. A radio in a medium sends into it,
+and hears with an aperture of (lambda / n_rx)^2 / 4 pi: S = sqrt|det M| / (n_tx n_rx), which makes
+Friis' law of the medium's own wavelength between two radios in it.
 """
 
 from dataclasses import dataclass
@@ -34,20 +41,31 @@ def segments(vertices: Float[Tensor, "c k 3"]) -> tuple[Tensor, Tensor]:
     return (delta * direction).sum(-1), direction
 
 
-def multipliers(directions: Float[Tensor, "c s 3"], gradient: Float[Tensor, "c d 3"]) -> Tensor:
-    """lambda_i that best balance (u_i - u_{i+1}) + lambda_i grad f_i = 0 [c d]."""
+def multipliers(
+    directions: Float[Tensor, "c s 3"],
+    gradient: Float[Tensor, "c d 3"],
+    index: Float[Tensor, "c s"] | None = None,
+) -> Tensor:
+    """lambda_i that best balance (n_i u_i - n_{i+1} u_{i+1}) + lambda_i grad f_i = 0 [c d]."""
+    directions = directions if index is None else index[..., None] * directions
     bend = directions[:, :-1] - directions[:, 1:]
     square = (gradient * gradient).sum(-1)
     return -(bend * gradient).sum(-1) / torch.where(square == 0, 1.0, square)
 
 
-def kkt(vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"]) -> Kkt:
-    """Assemble the Newton system of chains with D = k - 2 >= 1 reflections."""
+def kkt(
+    vertices: Float[Tensor, "c k 3"],
+    jet: Jet,
+    lam: Float[Tensor, "c d"],
+    index: Float[Tensor, "c s"] | None = None,
+) -> Kkt:
+    """Assemble the Newton system of chains with D = k - 2 >= 1 vertices; index: 1 where None."""
     c, depth = lam.shape
     length, u = segments(vertices)
+    index = torch.ones_like(length) if index is None else index
     eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
     inverse = 1.0 / torch.where(length > 0, length, torch.ones_like(length))
-    across = (eye - u[..., :, None] * u[..., None, :]) * inverse[..., None, None]
+    across = (eye - u[..., :, None] * u[..., None, :]) * (index * inverse)[..., None, None]
     n = 4 * depth
     matrix = vertices.new_zeros(c, n, n)
     for i in range(depth):
@@ -61,7 +79,8 @@ def kkt(vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"]) -
             b = slice(3 * i + 3, 3 * i + 6)
             matrix[:, a, b] = -across[:, i + 1]
             matrix[:, b, a] = -across[:, i + 1]
-    bend = u[:, :-1] - u[:, 1:] + lam[..., None] * jet.gradient
+    pull = index[..., None] * u
+    bend = pull[:, :-1] - pull[:, 1:] + lam[..., None] * jet.gradient
     return Kkt(matrix, torch.cat([bend.reshape(c, 3 * depth), jet.value], 1))
 
 
@@ -75,18 +94,23 @@ def solve_regular(
 
 
 def spreading(
-    vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"], cap: Float[Tensor, ""]
+    vertices: Float[Tensor, "c k 3"],
+    jet: Jet,
+    lam: Float[Tensor, "c d"],
+    cap: Float[Tensor, ""],
+    index: Float[Tensor, "c s"] | None = None,
 ) -> tuple[Float[Tensor, "c"], Bool[Tensor, "c"], Bool[Tensor, "c"]]:
-    """S [1/m] of chains with reflections, which were capped at a caustic, and which were regular.
+    """S [1/m] of chains with vertices, which were capped at a caustic, and which were regular.
 
     Each singular value of the transverse M is held below ``cap`` [1/m], the inverse of a wavelength:
     a focus is never brighter than a source one wavelength away.
     """
     length, u = segments(vertices)
     eye = torch.eye(3, dtype=vertices.dtype, device=vertices.device)
+    # each end's index, by which S is divided, is left out of its side of M instead
     first = (eye - u[:, 0, :, None] * u[:, 0, None, :]) / length[:, 0, None, None]
     last = (eye - u[:, -1, :, None] * u[:, -1, None, :]) / length[:, -1, None, None]
-    system = kkt(vertices, jet, lam)
+    system = kkt(vertices, jet, lam, index)
     depth = lam.shape[1]
     right = vertices.new_zeros(len(vertices), 4 * depth, 3)
     right[:, 3 * depth - 3 : 3 * depth] = -last
@@ -99,7 +123,10 @@ def spreading(
 
 
 def caustics(
-    vertices: Float[Tensor, "c k 3"], jet: Jet, lam: Float[Tensor, "c d"]
+    vertices: Float[Tensor, "c k 3"],
+    jet: Jet,
+    lam: Float[Tensor, "c d"],
+    index: Float[Tensor, "c s"] | None = None,
 ) -> Int[Tensor, "c"]:
     """How many caustics each path has passed through: the Morse index of its length.
 
@@ -108,7 +135,7 @@ def caustics(
     such direction turns e^{-j pi/4} of stationary phase into e^{+j pi/4}. The bordered matrix has one
     negative eigenvalue more for every surface that holds a vertex.
     """
-    system = kkt(vertices, jet, lam).matrix
+    system = kkt(vertices, jet, lam, index).matrix
     return (torch.linalg.eigvalsh(system) < 0).sum(1) - lam.shape[1]
 
 

@@ -80,8 +80,13 @@ def surfaces_of(world: World, batch: Batch, facets: Facets | None) -> Surfaces:
     return Surfaces(world, which, planar, normal, offset, ~world.exact[which], facets)
 
 
-def newton(batch: Batch, surfaces: Surfaces, rounds: int) -> tuple[Tensor, Tensor]:
-    """Newton on the Lagrangian from batch.x, steps held to half the shortest neighbouring segment."""
+def newton(
+    batch: Batch, surfaces: Surfaces, rounds: int, index: Float[Tensor, "c s"] | None = None
+) -> tuple[Tensor, Tensor]:
+    """Newton on the Lagrangian from batch.x, steps held to half the shortest neighbouring segment.
+
+    index: of refraction, of what each segment runs in; 1 where None.
+    """
     x = batch.x
     c, depth = batch.which.shape
     settled = torch.zeros(c, dtype=torch.bool, device=x.device)
@@ -89,7 +94,7 @@ def newton(batch: Batch, surfaces: Surfaces, rounds: int) -> tuple[Tensor, Tenso
         vertices = batch.polyline(x)
         length, u = segments(vertices)
         jet = surfaces.jet(x)
-        system = kkt(vertices, jet, multipliers(u, jet.gradient))
+        system = kkt(vertices, jet, multipliers(u, jet.gradient, index), index)
         step, regular = solve_regular(system.matrix, system.residual[..., None])
         dx = -step[:, : 3 * depth, 0].reshape(c, depth, 3)
         # no further than half a segment, nor than half a radius of curvature: Newton's model ends there

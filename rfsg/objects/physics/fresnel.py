@@ -41,6 +41,21 @@ def interface(
     return r[..., 0], r[..., 1]
 
 
+def refraction(
+    cos_incidence: Float[Tensor, "*#b"], eps_c: Complex[Tensor, "*#b"]
+) -> Complex[Tensor, "*b 2"]:
+    """sqrt(1 - R^2), (TE, TM), of a wave through one face of a half-space, the same both ways.
+
+    The field transmission t is this times sqrt(p_1 / p_2), with p = cos theta (TE) or kappa the
+    admittances of the two sides (Born and Wolf 1.5.2): the power through a unit of the face stays,
+    its ray tube widens. Into and out of a layer of parallel faces, t_12 t_21 = 1 - R^2.
+    ``cos_incidence`` is that on the side of free space.
+    """
+    cosine = _cosine(cos_incidence)
+    kappa, admittance = _layer(cosine, eps_c)
+    return 2 * torch.sqrt(admittance * kappa[..., None]) / (kappa[..., None] + admittance)
+
+
 def slab(
     cos_incidence: Float[Tensor, "*#b"],
     eps_c: Complex[Tensor, "*#b"],
