@@ -148,7 +148,9 @@ def write_channel(result: Any, file: Path) -> None:
 
     gain [p, f] complex, delay [p] s, frequency [f] Hz, doppler [p] Hz, departure and arrival
     [p, 3], tx and rx [p] into tx_paths and rx_paths, which [p, d] and crossed [x, 3] into
-    node_paths (-1 pads), vertices [p, d+2, 3] m, status [p], path_gain [tx, rx, f] linear.
+    node_paths (-1 pads), vertices [p, d+2, 3] m, status [p], path_gain [tx, rx, f] linear. Where a
+    radio has several ports: mimo [tx, rx, f, ports of rx, ports of tx], zeros beyond the
+    mimo_tx_ports [tx] and mimo_rx_ports [rx] that each has.
     """
     scene, channel, paths = result.scene, result.channel, result.paths
     names = ("tx", "rx", "frequency", "delay", "gain", "doppler", "departure", "arrival")
@@ -162,7 +164,28 @@ def write_channel(result: Any, file: Path) -> None:
         "rx_paths": np.array([radio.path for radio in scene.receivers], dtype=str),
         "node_paths": np.array([node.path for node in scene.nodes], dtype=str),
     }
-    np.savez_compressed(file, **arrays)
+    np.savez_compressed(file, **arrays, **_mimo_arrays(result))
+
+
+def _mimo_arrays(result: Any) -> dict[str, Any]:
+    """The mimo_* arrays of channel.npz; why there are none, if there should be; else nothing."""
+    from rfsg.scene.radios import port_names
+    from rfsg.scene.scene import SceneError
+    from rfsg.tracer.mimo import mimo
+
+    radios = (*result.scene.transmitters, *result.scene.receivers)
+    if all(len(port_names(radio)) == 1 for radio in radios):
+        return {}
+    try:
+        found = mimo(result)
+        matrices = found.padded()
+    except SceneError as error:  # too large; the rest of the run is not lost for it
+        return {"mimo_left_out": np.array(str(error))}
+    return {
+        "mimo": _numpy(matrices),
+        "mimo_tx_ports": np.array([len(ports) for ports in found.tx_ports]),
+        "mimo_rx_ports": np.array([len(ports) for ports in found.rx_ports]),
+    }
 
 
 def write_map(radio_map: Any, file: Path) -> None:
