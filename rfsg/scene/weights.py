@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from rfsg.objects.body import Body
 from rfsg.objects.catalogue import shape_class, surface_class
+from rfsg.objects.shapes.presence import absence
 from rfsg.scene.scene import SceneError
 
 FORMAT_VERSION = 1
@@ -52,7 +53,8 @@ def unpack(data: bytes, where: str) -> Body:
     """The body in safetensors bytes. ``where`` begins each fault.
 
     Raises SceneError with every fault found: header, version, kinds, declared sizes, and names,
-    shapes, dtypes and finiteness of the tensors against the declared architecture.
+    shapes, dtypes and finiteness of the tensors against the declared architecture, and whether a
+    learned shape has a surface at all.
     """
     head = _head(data, where)
     try:
@@ -72,6 +74,8 @@ def unpack(data: bytes, where: str) -> Body:
         for name in sorted(tensors)
         if name.split(".", 1)[0] not in ("shape", "surface")
     ]
+    if not faults and not parts["shape"].exact and (why := absence(parts["shape"])):
+        faults.append(f"{where}: the {parts['shape'].kind} shape {why}")
     if faults:
         raise SceneError(faults)
     return Body(parts["shape"], parts["surface"])

@@ -98,6 +98,18 @@ def complex_permittivity(
     return from_constants(a * ghz**b, c * ghz**d, frequency)
 
 
+def bands(name: str) -> str:
+    """Where the Recommendation gives a material, in words; ValueError for an unknown name."""
+    ranges = ", ".join(f"{row.low:g}-{row.high:g} GHz" for row in _rows(name))
+    return f"ITU-R P.2040-4 gives it for {ranges}"
+
+
+def outside(name: str, frequency_hz: Float[Tensor, "f"]) -> list[float]:
+    """The frequencies [Hz] among these for which the Recommendation does not give a material."""
+    rows = _rows(name)
+    return [hz for hz in frequency_hz.reshape(-1).tolist() if not _inside(rows, hz)]
+
+
 def permittivity_slope(
     name: str, frequency_hz: Float[Tensor, "*f"], extrapolate: bool = False
 ) -> Complex[Tensor, "*f"]:
@@ -137,17 +149,19 @@ def _coefficients(name: str, frequency: Tensor, extrapolate: bool) -> tuple[Tens
 def _row(name: str, rows: Sequence[Row], hz: float, extrapolate: bool) -> Row:
     if not (hz > 0 and math.isfinite(hz)):
         raise ValueError(f"frequency: expected a positive number of hertz, got {hz!r}")
-    # Edges are compared in hertz, where every edge of the table is a whole number.
-    for row in rows:
-        if _edge(row.low) <= hz <= _edge(row.high):
-            return row
+    if found := _inside(rows, hz):
+        return found[0]
     if not extrapolate:
-        bands = ", ".join(f"{row.low:g}-{row.high:g} GHz" for row in rows)
         raise ValueError(
-            f"{name}: ITU-R P.2040-4 gives it for {bands}, not for {hz / 1e9:g} GHz; pass "
+            f"{name}: {bands(name)}, not for {hz / 1e9:g} GHz; pass "
             "extrapolate=True to use the nearest band's formula, or give eps_r and sigma"
         )
     return min(rows, key=lambda row: _octaves_away(row, hz))
+
+
+def _inside(rows: Sequence[Row], hz: float) -> list[Row]:
+    """The rows that hold; edges are compared in hertz, where each is a whole number."""
+    return [row for row in rows if _edge(row.low) <= hz <= _edge(row.high)]
 
 
 def _edge(ghz: int | float) -> int:
