@@ -26,7 +26,17 @@ LINK_COLUMNS = (
     "rx",
     "path_gain_db",
     "rss_dbm",
+    "mean_delay_ns",
     "delay_spread_ns",
+    "excess_delay_ns",
+    "k_factor_db",
+    "coherence_bandwidth_hz",
+    "asd_deg",
+    "asa_deg",
+    "zsd_deg",
+    "zsa_deg",
+    "doppler_spread_hz",
+    "coherence_time_s",
     "n_paths",
     "los",
 )
@@ -44,6 +54,7 @@ PATH_COLUMNS = (
     "interactions",
     "vertices",
 )
+ACT_WORDS = ("reflection", "diffraction", "scattering", "refraction_in", "refraction_out")  # by Act
 _PACKAGES = ("rfsg", "torch", "numpy", "scipy", "embreex", "usd-core", "manifold3d", "trimesh")
 
 
@@ -89,7 +100,8 @@ def write_paths(result: Any, file: Path) -> None:
 
     ``phase_rad`` is that of gain * exp(-j 2 pi f delay), in (-pi, pi]. Angles are in the world:
     departure along the travel from the transmitter, arrival from the receiver back to the wave.
-    ``interactions`` lists reflections and penetrations in order along the path. ``vertices`` is "x y z; x y z".
+    ``interactions`` lists what happens in order along the path, in the words of ``ACT_WORDS`` and
+    "penetration"; ``vertices`` is "x y z; x y z".
     """
     _write_table(file, PATH_COLUMNS, path_rows(result))
 
@@ -100,15 +112,15 @@ def path_rows(result: Any) -> list[dict[str, Any]]:
 
     scene, paths, channel = result.scene, result.paths, result.channel
     gain, delay, doppler = (_numpy(x) for x in (channel.gain, channel.delay, channel.doppler))
-    which, vertices = _numpy(paths.which), _numpy(paths.vertices)
+    which, act, vertices = (_numpy(x) for x in (paths.which, paths.act, paths.vertices))
     phase = np.angle(_numpy(coefficients(channel))[:, 0])
     tx, rx = _numpy(channel.tx), _numpy(channel.rx)
     leave, arrive = angles_deg(_numpy(channel.departure)), angles_deg(_numpy(channel.arrival))
     through = _crossed_by_path(channel)
     rows = []
     for p in arriving(channel):
-        solid = [int(i) for i in which[p] if i >= 0]
-        corners = vertices[p][: len(solid) + 2]
+        acts = [(int(a), int(i)) for a, i in zip(act[p], which[p], strict=True) if i >= 0]
+        corners = vertices[p][: len(acts) + 2]
         rows.append(
             {
                 "tx": scene.transmitters[tx[p]].path,
@@ -121,7 +133,7 @@ def path_rows(result: Any) -> list[dict[str, Any]]:
                 "aod_elevation_deg": leave[p, 1],
                 "aoa_azimuth_deg": arrive[p, 0],
                 "aoa_elevation_deg": arrive[p, 1],
-                "interactions": _interactions(scene, solid, through.get(int(p), [])),
+                "interactions": _interactions(scene, acts, through.get(int(p), [])),
                 "vertices": "; ".join(" ".join(f"{x:.6f}" for x in corner) for corner in corners),
             }
         )
@@ -287,13 +299,16 @@ def _short(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value).replace(" ", "")
 
 
-def _interactions(scene: "Scene", reflected: list[int], crossed: list[tuple[int, int]]) -> str:
-    """Reflections on nodes, and penetrations as (segment, node), in order along the path."""
+def _interactions(
+    scene: "Scene", acts: list[tuple[int, int]], crossed: list[tuple[int, int]]
+) -> str:
+    """What happens at vertices, as (act, node), and penetrations, as (segment, node), in order."""
     words = []
-    for segment in range(len(reflected) + 1):
+    for segment in range(len(acts) + 1):
         words += [f"penetration({scene.nodes[i].path})" for s, i in crossed if s == segment]
-        if segment < len(reflected):
-            words.append(f"reflection({scene.nodes[reflected[segment]].path})")
+        if segment < len(acts):
+            act, node = acts[segment]
+            words.append(f"{ACT_WORDS[act]}({scene.nodes[node].path})")
     return " ".join(words) or "line_of_sight"
 
 

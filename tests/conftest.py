@@ -70,6 +70,7 @@ def small_run():
     from rfsg.scene.pose import Pose
     from rfsg.scene.radios import Radio
     from rfsg.scene.scene import Node, Scene
+    from rfsg.tracer.channel import links
     from rfsg.tracer.launch import SearchReport
     from rfsg.tracer.plan import Plan, Quality
     from rfsg.tracer.records import Channel, Paths
@@ -121,12 +122,6 @@ def small_run():
         crossed=torch.tensor([[2, 1, 0], [3, 1, 0]]),
         blocked=torch.tensor([False, False, False, True]),
     )
-    links = [
-        {"tx": "/World/AP", "rx": "/World/rx_0", "path_gain_db": -44.0, "rss_dbm": -34.0}
-        | {"delay_spread_ns": 4.0, "n_paths": 2, "los": True},
-        {"tx": "/World/AP", "rx": "/World/rx_1", "path_gain_db": -45.5, "rss_dbm": -35.5}
-        | {"delay_spread_ns": 0.0, "n_paths": 1, "los": False},
-    ]
     return SimpleNamespace(
         scene=scene,
         paths=paths,
@@ -136,6 +131,6 @@ def small_run():
         search=SearchReport(rays=100),
         seconds={"search": 0.1, "solve": 0.2},
         warnings=["a warning"],
-        links=lambda: links,
+        links=lambda: links(scene, paths, channel),
         path_gain=lambda: real([[[4e-5], [2.8e-5]]]),
     )

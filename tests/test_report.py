@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from rfsg import report
+from rfsg.tracer.channel import Link
+from rfsg.tracer.records import Act
 
 SPEED_OF_LIGHT = 299_792_458.0
 
@@ -41,6 +43,14 @@ def test_a_path_row_says_what_the_channel_says(small_run):
     assert direct["aoa_azimuth_deg"] == pytest.approx(180.0)
 
 
+@pytest.mark.parametrize("act", Act)
+def test_every_act_has_its_word(small_run, act):
+    words = {Act.REFLECT: "reflection", Act.DIFFRACT: "diffraction", Act.SCATTER: "scattering"}
+    words |= {Act.ENTER: "refraction_in", Act.LEAVE: "refraction_out"}
+    small_run.paths.act[1] = int(act)
+    assert report.path_rows(small_run)[1]["interactions"] == f"{words[act]}(/World/Wall)"
+
+
 @pytest.mark.parametrize(
     ("direction", "azimuth", "elevation"),
     [((1, 0, 0), 0, 0), ((0, 1, 0), 90, 0), ((-1, 0, 0), 180, 0), ((0, 0, -1), 0, -90)]
@@ -52,11 +62,27 @@ def test_angles(direction, azimuth, elevation):
 
 
 def test_links_without_a_path_leave_their_cells_empty(tmp_path):
-    silent = {"tx": "/A", "rx": "/B", "path_gain_db": -np.inf, "rss_dbm": -np.inf}
-    silent |= {"delay_spread_ns": 0.0, "n_paths": 0, "los": False}
+    silent = dict.fromkeys(report.LINK_COLUMNS, 0.0) | {"n_paths": 0, "los": False}
+    silent |= {"path_gain_db": -np.inf, "coherence_time_s": np.inf}
     report.write_links(SimpleNamespace(links=lambda: [silent]), tmp_path / "links.csv")
     (row,) = read(tmp_path / "links.csv")
-    assert row["path_gain_db"] == "" and row["n_paths"] == "0" and row["los"] == "0"
+    assert row["path_gain_db"] == row["coherence_time_s"] == ""
+    assert row["delay_spread_ns"] == row["n_paths"] == row["los"] == "0"
+
+
+def test_links_are_written_with_every_column(small_run, tmp_path):
+    assert report.LINK_COLUMNS == tuple(Link.__annotations__)
+    report.write_links(small_run, tmp_path / "links.csv")
+    near, far = read(tmp_path / "links.csv")
+    assert (far["rx"], far["n_paths"], far["los"]) == ("/World/rx_1", "1", "0")
+    assert (near["rx"], near["los"], near["n_paths"]) == ("/World/rx_0", "1", "2")
+    # powers go as one over the squared length: 4 m and 2 hypot(2, 2.9) m
+    assert float(near["k_factor_db"]) == pytest.approx(20 * np.log10(np.hypot(2, 2.9) / 2))
+    # the receiver's two directions: straight, and off the wall in the middle
+    share = 1 / (1 + 4 / np.hypot(2, 2.9) ** 2)
+    turn = np.arctan2(2.9, 2.0)
+    r = abs(share + (1 - share) * np.exp(1j * turn))
+    assert float(near["asa_deg"]) == pytest.approx(np.degrees(np.sqrt(-2 * np.log(r))), rel=1e-6)
 
 
 def test_the_channel_file_holds_the_same_bits(small_run, tmp_path):
