@@ -13,7 +13,7 @@ The rest of the field is the coefficient of ``objects.physics.utd``, in metres^(
 """
 
 import math
-from collections.abc import Iterator
+from collections import Counter
 from dataclasses import dataclass
 
 import torch
@@ -29,7 +29,7 @@ from rfsg.tracer.faces import Planes, planes_of
 from rfsg.tracer.images import fold, images_of
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.records import Act, Paths, Status
+from rfsg.tracer.records import Act, Found, Paths, Status
 from rfsg.tracer.sequences import Budget, Prefixes, TooMany, levels
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
@@ -37,7 +37,8 @@ ROUNDS = 30  # Newton steps; the length is convex along straight edges
 SETTLED = 1e-12  # of the path's length: the last step of a converged edge point
 RIM_LOOKS = 90  # places round a rim at which stationary points are looked for
 SAME = 1e-9  # of the length: closer than this to an edge's end still belongs to it
-MOST_PAIRS = 20_000_000  # sources x edges x destinations that one scene may ask for
+MOST_PAIRS = 300_000_000  # sources x edges x destinations: a minute of closed forms
+MOST_TWICE = 3_000_000  # pairs of edges between pairs of radios: a minute of Newton steps
 
 
 @dataclass(frozen=True)
@@ -62,53 +63,71 @@ def paths_of(
     rx: Float[Tensor, "r 3"],
     wavelength: float,
     quality: Quality,
-) -> tuple[list[Paths], dict[Status, int]]:
-    """Diffracted paths, and how many candidates ended in each status.
+) -> Found:
+    """Every path round one edge, with up to ``diffraction_depth - 1`` planar mirrors before and after
+    it, and with ``diffraction=2`` round two straight edges without mirrors.
 
-    One edge with up to ``diffraction_depth - 1`` planar mirrors before and after it; with
-    ``diffraction=2`` also two straight edges and no mirror. Raises ValueError when the scene has more
-    combinations than ``MOST_PAIRS``. Differentiable in poses, sizes and positions.
+    Differentiable in poses, sizes and positions.
     """
+    if not len(edges):
+        return Found(left_out=("edge diffraction: no object has an edge that stands free",))
     planes = planes_of(world)
     found: list[Paths] = []
-    counts: dict[Status, int] = {}
-    try:
-        some = [b for b in candidates(world, planes, edges, tx, rx, quality) if len(b.tx)]
-    except TooMany:
-        raise ValueError(
-            f"diffraction: {len(edges)} edges between {len(tx)} transmitters and {len(rx)} receivers "
-            "are too many; lower diffraction_depth or diffraction, or ask for fewer receivers"
-        ) from None
-    for bends in some:
-        paths = _exact(world, planes, edges, bends, tx, rx, wavelength)
-        for status, n in zip(*torch.unique(paths.status, return_counts=True), strict=True):
-            counts[Status(int(status))] = counts.get(Status(int(status)), 0) + int(n)
-        good = (paths.status == int(Status.OK)) | (paths.status == int(Status.CAUSTIC_CAPPED))
-        found.append(paths.take(torch.nonzero(good).squeeze(-1)))
-    return found, counts
+    counts: Counter[Status] = Counter()
+    left_out: list[str] = []
+    for stage in (_one_edge, _mirrors_and_an_edge, _two_edges):
+        try:
+            for bends in stage(planes, edges, tx, rx, quality):
+                for i in torch.arange(len(bends.tx), device=tx.device).split(quality.chunk):
+                    paths = _exact(world, planes, edges, bends.take(i), tx, rx, wavelength)
+                    for status in paths.status.tolist():
+                        counts[Status(status)] += 1
+                    good = paths.status <= int(Status.CAUSTIC_CAPPED)
+                    found.append(paths.take(torch.nonzero(good).squeeze(-1)))
+        except TooMany:
+            left_out.append(
+                f"diffraction, {_WHAT[stage]}: {len(edges)} edges, {len(tx)} transmitters and "
+                f"{len(rx)} receivers have too many combinations; ask for fewer receivers at a time"
+            )
+    said = f"edge diffraction round up to {quality.diffraction} of {len(edges)} edges"
+    return Found(tuple(found), dict(counts), (said,), tuple(left_out))
 
 
-# the search: which mirrors and edges, without gradients
+# the search: which mirrors and edges, without gradients. Each stage is done whole or not at all, so
+# that what is followed does not depend on which end transmits.
 
 
 @torch.no_grad()
-def candidates(
-    world: World, planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
-) -> Iterator[Bends]:
-    """Every combination whose edge points lie on their edges, outside of their wedges."""
-    if not len(edges) or not quality.diffraction:
-        return
-    budget = Budget(MOST_PAIRS)
+def _one_edge(
+    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+) -> list[Bends]:
+    """Round one edge, no mirrors."""
+    if not (len(edges) and quality.diffraction):
+        return []
+    fore, t = _stack([levels(planes, p, 0, Budget(MOST_PAIRS))[0] for p in tx])
+    aft, r = _stack([levels(planes, p, 0, Budget(MOST_PAIRS))[0] for p in rx])
+    return _bends(edges, fore, t, aft, r, Budget(MOST_PAIRS))
+
+
+@torch.no_grad()
+def _mirrors_and_an_edge(
+    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+) -> list[Bends]:
+    """Round one edge, with planar mirrors before it and after it."""
     mirrors = max(0, min(quality.depth, quality.diffraction_depth) - 1)
+    if not (len(edges) and quality.diffraction and mirrors):
+        return []
+    budget = Budget(MOST_PAIRS)
     ahead = [levels(planes, p, mirrors, budget) for p in tx]
     behind = [levels(planes, p, mirrors, budget) for p in rx]
+    found: list[Bends] = []
     for i in range(mirrors + 1):
         for j in range(mirrors + 1 - i):
-            fore, t = _stack([level[i] for level in ahead])
-            aft, r = _stack([level[j] for level in behind])
-            yield from _one_edge(edges, fore, t, aft, r, budget)
-    if quality.diffraction > 1:
-        yield from _two_edges(edges, tx, rx, budget)
+            if i + j:
+                fore, t = _stack([level[i] for level in ahead])
+                aft, r = _stack([level[j] for level in behind])
+                found += _bends(edges, fore, t, aft, r, budget)
+    return found
 
 
 def _stack(parts: list[Prefixes]) -> tuple[Prefixes, Int[Tensor, "p"]]:
@@ -117,22 +136,22 @@ def _stack(parts: list[Prefixes]) -> tuple[Prefixes, Int[Tensor, "p"]]:
     return whole, torch.cat(owner)
 
 
-def _one_edge(
+def _bends(
     edges: Edges, fore: Prefixes, t: Tensor, aft: Prefixes, r: Tensor, budget: Budget
-) -> Iterator[Bends]:
+) -> list[Bends]:
     """Images at both ends of every edge: in closed form where it is straight, looked up on a rim."""
+    found = []
     p, q = len(fore.image), len(aft.image)
     budget.spend(p * q * len(edges))
-    for begin in range(0, len(edges), 64):
-        some = torch.arange(begin, min(len(edges), begin + 64), device=t.device)
+    for some in torch.arange(len(edges), device=t.device).split(64):
         own = edges.take(some)
         for a in torch.arange(p, device=t.device).split(max(1, 2_000_000 // (64 * max(q, 1)))):
             row, column, e, place = _stationary(own, fore.image[a], aft.image)
             ahead = a[row]
-            yield Bends(
-                t[ahead], r[column], fore.faces[ahead], some[e][:, None], place[:, None],
-                aft.faces[column],
-            )  # fmt: skip
+            faces = (fore.faces[ahead], aft.faces[column])
+            edge = some[e][:, None]
+            found.append(Bends(t[ahead], r[column], faces[0], edge, place[:, None], faces[1]))
+    return found
 
 
 def _stationary(edges: Edges, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -194,26 +213,49 @@ def _on_rims(edges: Edges, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor
     return i, j, k, edges.length[k] * (share[s] + gone / RIM_LOOKS)
 
 
-def _two_edges(edges: Edges, tx: Tensor, rx: Tensor, budget: Budget) -> Iterator[Bends]:
-    """Ordered pairs of straight edges: those of one object share a face, those of two may be any."""
+@torch.no_grad()
+def _two_edges(
+    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+) -> list[Bends]:
+    """Ordered pairs of straight edges: of one object with a face in common, or of two objects."""
     straight = torch.nonzero(edges.straight).squeeze(-1)
+    if quality.diffraction < 2 or len(straight) < 2:
+        return []
     own = edges.take(straight)
-    seen = [_cylindrical(own, end)[2] for end in (tx, rx)]
-    share = torch.zeros(len(own), len(own), dtype=torch.bool, device=tx.device)
+    n = len(own)
+    Budget(MOST_PAIRS).spend(n * n)
+    share = torch.zeros(n, n, dtype=torch.bool, device=tx.device)
     for first in (own.patch0, own.patch1):
         for second in (own.patch0, own.patch1):
             share |= first[:, None] == second[None]
-    pairs = (own.node[:, None] != own.node[None]) | share
+    same = own.node[:, None] == own.node[None]
+    pairs = (share | ~same) & _face_each_other(own)
     pairs.fill_diagonal_(False)
-    budget.spend(len(tx) * len(rx) * int(pairs.sum()))
+    seen = [_cylindrical(own, end)[2] for end in (tx, rx)]
+    budget, found = Budget(MOST_TWICE), []
     for t in range(len(tx)):
         for r in range(len(rx)):
             a, b = torch.nonzero(pairs & seen[0][t][:, None] & seen[1][r][None], as_tuple=True)
+            budget.spend(len(a))
             edge = torch.stack([straight[a], straight[b]], 1)
             none = torch.zeros(len(a), 0, dtype=torch.int64, device=tx.device)
             ends = (torch.full_like(a, t), torch.full_like(a, r))
-            middle = 0.5 * edges.length[edge]
-            yield Bends(*ends, none, edge, middle, none)
+            found.append(Bends(*ends, none, edge, 0.5 * edges.length[edge], none))
+    return found
+
+
+def _face_each_other(edges: Edges) -> Bool[Tensor, "e e"]:
+    """Edges of which some end lies outside of the other's wedge, and the other way about."""
+    ends = [edges.point(share * edges.length)[0] for share in (0.0, 1.0)]
+    outside = _cylindrical(edges, ends[0])[2] | _cylindrical(edges, ends[1])[2]
+    return outside & outside.T
+
+
+_WHAT = {
+    _one_edge: "one edge",
+    _mirrors_and_an_edge: "mirrors before or after an edge",
+    _two_edges: "two edges",
+}
 
 
 # the exact path, with gradients

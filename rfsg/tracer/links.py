@@ -27,7 +27,8 @@ def largest(
     """Largest of a value that is never negative over each link; 0 where there are no paths."""
     zero = value.new_zeros(n_tx * n_rx, value.shape[1])
     link = link_of(channel, n_rx)[:, None].expand_as(value)
-    return zero.scatter_reduce(0, link, value, "amax").reshape(n_tx, n_rx, -1)
+    most = zero.scatter_reduce(0, link, value, "amax")
+    return most.reshape(n_tx, n_rx, value.shape[1])
 
 
 def strongest(
@@ -35,7 +36,7 @@ def strongest(
 ) -> Bool[Tensor, "p f"]:
     """Which path of each link carries most; the first of equals, and none where nothing is carried."""
     link = link_of(channel, n_rx)
-    peak = largest(channel, weight, n_tx, n_rx).reshape(-1, weight.shape[1])
+    peak = largest(channel, weight, n_tx, n_rx).flatten(0, 1)
     number = torch.arange(len(weight), device=weight.device)[:, None].expand_as(weight)
     at_peak = (weight > 0) & (weight == peak[link])
     first = number.new_full(peak.shape, len(weight)).scatter_reduce(

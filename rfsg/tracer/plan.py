@@ -97,6 +97,10 @@ class Plan:
     modelled: tuple[str, ...]
     left_out: tuple[str, ...]
 
+    def with_(self, modelled: tuple[str, ...] = (), left_out: tuple[str, ...] = ()) -> "Plan":
+        """The same plan with more to say."""
+        return Plan(self.quality, (*self.modelled, *modelled), (*self.left_out, *left_out))
+
 
 def make_plan(world: World, quality: Quality) -> Plan:
     """Look at the scene and say what it asks for."""
@@ -125,6 +129,7 @@ def make_plan(world: World, quality: Quality) -> Plan:
         modelled.append("Doppler of moving radios and objects")
     else:
         left_out.append("Doppler: nothing moves")
-    left_out.append("diffuse scattering and edge diffraction: not in this version")
+    if not quality.diffraction:
+        left_out.append("edge diffraction: not asked for (diffraction=0)")
     left_out.append(f"paths more than {-quality.floor_db:g} dB below free space of their length")
     return Plan(quality, tuple(modelled), tuple(left_out))

@@ -4,7 +4,7 @@ Index -1 pads short chains. Positions, lengths and delays are float64, in the wo
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 
 import torch
@@ -162,6 +162,17 @@ class Paths:
         return Paths(
             *(torch.cat([getattr(p, n) for p in parts]) for n in Paths.__dataclass_fields__)
         )
+
+
+@dataclass(frozen=True)
+class Found:
+    """What one mechanism adds to a simulation: paths, how many candidates ended in each status, and
+    sentences on what was modelled and what was left out."""
+
+    paths: tuple[Paths, ...] = ()
+    counts: dict[Status, int] = field(default_factory=dict)
+    modelled: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

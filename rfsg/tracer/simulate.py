@@ -14,7 +14,7 @@ from torch import Tensor
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
-from rfsg.tracer import diffraction
+from rfsg.tracer import diffraction, validity
 from rfsg.tracer import field as fields
 from rfsg.tracer.channel import Link, links, transfer
 from rfsg.tracer.edges import edges_in
@@ -81,6 +81,7 @@ def simulate(
     with torch.set_grad_enabled(gradients):
         with _timed(seconds, "plan", tell):
             world = world_for(scene, quality, device)
+            validity.refuse(world, frequencies)
             plan = make_plan(world, quality)
         with _timed(seconds, "proxies", tell):
             proxies = Proxies(world)
@@ -88,16 +89,18 @@ def simulate(
             report = SearchReport()
             if chains is None:
                 chains, report = search(world, proxies, tx, rx, frequencies, quality)
-                plan = replace(plan, modelled=(*plan.modelled, report.sentence()))
+                plan = plan.with_((report.sentence(),))
         with _timed(seconds, "solve", tell):
             wavelength = SPEED_OF_LIGHT / float(frequencies[0])
             paths, counts = solve(world, chains, tx, rx, wavelength, quality)
-            edges, found = None, [paths]
+            edges, more = None, []
             if quality.diffraction:
                 edges = edges_in(world, wavelength)
-                more, bent = diffraction.paths_of(world, edges, tx, rx, wavelength, quality)
-                found, counts = found + more, Counter(counts) + Counter(bent)
-            paths = Paths.joined(found)
+                more.append(diffraction.paths_of(world, edges, tx, rx, wavelength, quality))
+            paths = Paths.joined([paths, *(p for found in more for p in found.paths)])
+            for found in more:
+                counts = Counter(counts) + Counter(found.counts)
+                plan = plan.with_(found.modelled, found.left_out)
         with _timed(seconds, "field", tell):
             channel = fields.channel(
                 world,
@@ -111,8 +114,9 @@ def simulate(
             )
             paths, channel, counts = _above_floor(paths, channel, counts, quality)
     named = {s.name: n for s, n in sorted(counts.items())}
+    warnings = (*scene.warnings, *validity.sentences(world, frequencies))
     return Result(
-        scene, frequencies, paths, channel, chains, plan, report, named, seconds, scene.warnings
+        scene, frequencies, paths, channel, chains, plan, report, named, seconds, warnings
     )
 
 
@@ -162,10 +166,15 @@ def positions(radios: tuple[Radio, ...], device: torch.device | str) -> Float[Te
 def _above_floor(
     paths: Paths, channel: Channel, counts: dict[Status, int], quality: Quality
 ) -> tuple[Paths, Channel, dict[Status, int]]:
-    """Drop what is opaque or below the floor, and count it."""
+    """Drop what is opaque or below the floor, and count it.
+
+    Where radios are polarised the Jones matrix decides: a path that the reference ports do not see
+    (two +45 slants that face each other) is the whole channel of other ports.
+    """
     wavelength = SPEED_OF_LIGHT / channel.frequency
     free = wavelength[None] / (4 * math.pi) / paths.length.clamp(min=1e-300)[:, None]
-    loss = (channel.gain.detach().abs() / free.detach()).amax(1)
+    strength = channel.gain.abs() if channel.jones is None else channel.jones.abs().amax((2, 3))
+    loss = (strength.detach() / free.detach()).amax(1)
     weak = loss < 10.0 ** (quality.floor_db / 20.0)
     drop = weak | channel.blocked
     keep = torch.nonzero(~drop).squeeze(-1)
