@@ -18,6 +18,7 @@ SURFACES = {
     "conductor": "rfsg.objects.surfaces.interface:Conductor",
     "halfspace": "rfsg.objects.surfaces.interface:DielectricHalfSpace",
     "slab": "rfsg.objects.surfaces.slab:Slab",
+    "solid": "rfsg.objects.surfaces.solid:Solid",
     "stochastic": "rfsg.objects.surfaces.stochastic:StochasticSurface",
 }
 

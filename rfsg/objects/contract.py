@@ -109,7 +109,7 @@ class Shape(Protocol):
 class Surface(Protocol):
     """What a boundary and an interior do to a wave. A ``torch.nn.Module``."""
 
-    kind: str  # token in files: "conductor", "halfspace", "slab", "stochastic"
+    kind: str  # token in files: "conductor", "halfspace", "slab", "solid", "stochastic"
     opaque: bool  # True: nothing ever comes through; the tracer stops there
 
     def config(self) -> dict[str, object]:

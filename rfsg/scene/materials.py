@@ -5,8 +5,8 @@ from typing import Any
 
 from rfsg.objects.catalogue import surface_class
 
-MODELS = ("conductor", "halfspace", "slab", "stochastic")
-CONSTANTS = ("halfspace", "slab")  # the models that take permittivity and conductivity
+MODELS = ("conductor", "halfspace", "slab", "solid", "stochastic")
+CONSTANTS = ("halfspace", "slab", "solid")  # the models that take permittivity and conductivity
 SCATTERING = ("scattering", "lobe", "alpha_r", "alpha_i", "forward_share", "cross_share")
 
 # linear base colour and opacity of the preview surface, by ITU name or model
@@ -23,8 +23,8 @@ PLAIN_LOOK = ((0.5, 0.5, 0.5), 1.0)
 
 @dataclass(frozen=True)
 class Material:
-    """What a prim says of its material: a model and, for halfspace and slab, either an ITU-R P.2040
-    name or a relative permittivity and a conductivity [S/m]; thickness [m] for slab. extrapolate:
+    """What a prim says of its material: a model and, for halfspace, slab and solid, either an ITU-R
+    P.2040 name or a relative permittivity and a conductivity [S/m]; thickness [m] for slab. extrapolate:
     whether the ITU formula may be used outside its bands. scattering and what follows: how a rough
     one scatters, as ``rfsg.objects.physics.lobes.Scattering`` takes it; the lobe is Lambertian where
     none is named."""
@@ -59,6 +59,8 @@ class Material:
             return [f"model {self.model} needs itu, or epsR and sigma"]
         if self.model == "halfspace" and self.thickness is not None:
             return ["model halfspace has no thickness; use slab"]
+        if self.model == "solid" and self.thickness is not None:
+            return ["model solid is as thick as its shape and takes no thickness; use slab"]
         return []
 
     def surface(self) -> Any:

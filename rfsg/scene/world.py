@@ -6,7 +6,9 @@ in float32.
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -16,6 +18,7 @@ from torch import Tensor, nn
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Contact, Crossing, Jet, Shape
 from rfsg.objects.shapes.analytic import Box, Boxes, HalfSpace
+from rfsg.objects.surfaces.solid import PARALLEL, Backed, Solid, depth_behind, stretched
 from rfsg.scene.scene import Scene
 
 
@@ -65,6 +68,9 @@ class World:
         extent = self.bounds_object[:, 1] - self.bounds_object[:, 0]
         size = torch.where(torch.isfinite(extent), extent, torch.zeros_like(extent)).amax(-1)
         self.size = torch.where(size > 0, size, torch.ones_like(size)) * self.scale.detach()
+        self.solid = self._flags(lambda b: isinstance(b.surface, Solid))
+        media, self.medium = _distinct([_medium_key(n.body) for n in nodes], self.device)
+        self.media = [m.surface for m in media]
 
     def __len__(self) -> int:
         return len(self.scene.nodes)
@@ -255,35 +261,174 @@ class World:
         )
         for body, i in self.surface_groups(which):
             mine = Contact(local.point[i], local.incoming[i], local.outgoing[i], local.normal[i])
+            if isinstance(body.surface, Solid):
+                behind = self.behind(which[i], contact.point[i], contact.normal[i])
+                mine = Backed(mine.point, mine.incoming, mine.outgoing, mine.normal, behind)
             yield body, i, mine
 
     def transmission(
-        self, which: Int[Tensor, "m"], crossing: Crossing, frequency: Float[Tensor, "f"]
+        self,
+        which: Int[Tensor, "m"],
+        crossing: Crossing,
+        frequency: Float[Tensor, "f"],
+        last: Int[Tensor, "m"] | None = None,
     ) -> Complex[Tensor, "m f 2"]:
-        """Transmission (TE, TM) relative to free space, of crossings given in the world."""
+        """Transmission (TE, TM) relative to free space, of crossings given in the world.
+
+        last: the nodes on which the stretches end, where these are several solids of one medium.
+        """
         out = _complex(which, frequency)
-        local = self._crossing_object(which, crossing)
-        for body, i in self.surface_groups(which):
-            out = out.index_copy(0, i, body.transmission(_take(local, i), frequency).to(out.dtype))
+        for body, i, mine in self._crossings_object(which, crossing, last):
+            out = out.index_copy(0, i, body.transmission(mine, frequency).to(out.dtype))
         return out
 
     def excess_delay(
-        self, which: Int[Tensor, "m"], crossing: Crossing, frequency: Float[Tensor, "f"]
+        self,
+        which: Int[Tensor, "m"],
+        crossing: Crossing,
+        frequency: Float[Tensor, "f"],
+        last: Int[Tensor, "m"] | None = None,
     ) -> Float[Tensor, "m f"]:
-        """Group delay beyond free space [s], of crossings given in the world."""
+        """Group delay beyond free space [s], of crossings given in the world; last as above."""
         out = torch.zeros(len(which), len(frequency), dtype=torch.float64, device=self.device)
-        local = self._crossing_object(which, crossing)
-        for body, i in self.surface_groups(which):
-            out = out.index_copy(0, i, body.excess_delay(_take(local, i), frequency).to(out.dtype))
+        for body, i, mine in self._crossings_object(which, crossing, last):
+            out = out.index_copy(0, i, body.excess_delay(mine, frequency).to(out.dtype))
         return out
 
-    def _crossing_object(self, which: Tensor, crossing: Crossing) -> Crossing:
-        return Crossing(
+    def _crossings_object(
+        self, which: Tensor, crossing: Crossing, last: Tensor | None
+    ) -> Iterator[tuple[Body, Tensor, Crossing]]:
+        local = Crossing(
             self.point_object(which, crossing.start),
             self.point_object(which, crossing.end),
             self.direction_object(which, crossing.normal_start),
             self.direction_object(which, crossing.normal_end),
         )
+        for body, i in self.surface_groups(which):
+            mine = Crossing(
+                local.start[i], local.end[i], local.normal_start[i], local.normal_end[i]
+            )
+            if isinstance(body.surface, Solid):
+                end = which[i] if last is None else last[i]
+                flat = self.is_flat(which[i], crossing.start[i])
+                flat &= self.is_flat(end, crossing.end[i])
+                exact = self.exact[which[i]] & self.exact[end]
+                mine = stretched(mine, flat, exact, self.scale[which[i]])
+            yield body, i, mine
+
+    # solids
+
+    def is_flat(
+        self, which: Int[Tensor, "m"], point_world: Float[Tensor, "m 3"]
+    ) -> Bool[Tensor, "m"]:
+        """Whether surface points lie on a plane face."""
+        return self.plane(which, self.patch(which, point_world))[2]
+
+    def index(self, which: Int[Tensor, "m"], frequency: Float[Tensor, "f"]) -> Float[Tensor, "m f"]:
+        """Index of refraction Re sqrt(eps_c) of solids."""
+        return self._of_media(which, lambda solid, i: solid.index(frequency).expand(len(i), -1))
+
+    def face(
+        self, which: Int[Tensor, "m"], cosine: Float[Tensor, "m"], frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "m f 2"]:
+        """(TE, TM) amplitude of passing one face of solids, at the |cos| outside."""
+        return self._of_media(which, lambda solid, i: solid.face(cosine[i], frequency))
+
+    def inside(
+        self, which: Int[Tensor, "m"], length: Float[Tensor, "m"], frequency: Float[Tensor, "f"]
+    ) -> Complex[Tensor, "m f"]:
+        """What lengths [m] inside solids do to a wave, relative to free space."""
+        return self._of_media(which, lambda solid, i: solid.inside(length[i], frequency))
+
+    def inside_delay(
+        self, which: Int[Tensor, "m"], length: Float[Tensor, "m"], frequency: Float[Tensor, "f"]
+    ) -> Float[Tensor, "m f"]:
+        """Group delay of lengths [m] inside solids, beyond free space [s]."""
+        return self._of_media(which, lambda solid, i: solid.inside_delay(length[i], frequency))
+
+    def _of_media(self, which: Tensor, ask: Callable[[Solid, Tensor], Tensor]) -> Tensor:
+        """One answer for every solid in ``which``, asked of each medium once."""
+        medium = self.medium[which]
+        order = torch.argsort(medium, stable=True)
+        parts = []
+        for k in torch.unique(medium).tolist():
+            parts.append(ask(self.media[k], torch.nonzero(medium == k).squeeze(-1)))
+        return torch.cat(parts)[torch.argsort(order)]
+
+    def behind(
+        self,
+        which: Int[Tensor, "m"],
+        point_world: Float[Tensor, "m 3"],
+        normal_world: Float[Tensor, "m 3"],
+    ) -> Float[Tensor, "m"]:
+        """How far solids reach behind plane faces, to a face parallel to them [m]; inf without one.
+
+        A solid of the same medium that is flush with the face behind is more of the same.
+        """
+        depth = self._depth(which, self.patch(which, point_world))
+        node = which
+        for _ in range(int(self.solid.sum())):
+            reached = torch.nonzero(torch.isfinite(depth) & (node >= 0)).squeeze(-1)
+            if not len(reached):
+                break
+            far = (point_world - depth[:, None] * normal_world)[reached]
+            following, more = self._flush(node[reached], far.detach(), normal_world[reached])
+            depth = depth.index_add(0, reached, more)
+            node = node.index_copy(0, reached, following)
+        return depth
+
+    def _flush(
+        self, which: Tensor, point: Tensor, normal: Tensor
+    ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
+        """The solid of the same medium that has, at points, a face looking along ``normal``, or -1;
+        and how deep it is there."""
+        following, depth = torch.full_like(which, -1), torch.zeros_like(point[:, 0])
+        for slot in self.adjacent.unbind(1):
+            i = torch.nonzero(slot[which] >= 0).squeeze(-1)
+            i = i[self.sdf(slot[which[i]], point[i]).abs() <= FLUSH]
+            node = slot[which[i]]
+            for patch in range(self._most_planes(node)):
+                face = torch.full_like(node, patch)
+                n, offset, planar = self.plane(node, face)
+                on = planar & ((n - normal[i]).abs().amax(-1) <= PARALLEL)
+                on &= ((n * point[i]).sum(-1) - offset).abs() <= FLUSH
+                following[i[on]] = node[on]
+                depth = depth.index_copy(0, i[on], self._depth(node[on], face[on]))
+        return following, depth
+
+    def _most_planes(self, which: Tensor) -> int:
+        shapes = [self.scene.nodes[k].body.shape for k in torch.unique(which).tolist()]
+        return max((len(shape.planes()) for shape in shapes), default=0)
+
+    @cached_property
+    def adjacent(self) -> Int[Tensor, "n k"]:
+        """Solids of the same medium that may touch each node, by their hulls; -1 pads."""
+        low, high = self.bounds_object.detach().unbind(1)
+        bounded = torch.isfinite(low).all(-1) & torch.isfinite(high).all(-1)
+        every = torch.arange(len(self), device=self.device)
+        centre = torch.where(bounded[:, None], 0.5 * (low + high), 0.0)
+        half = torch.where(bounded[:, None], 0.5 * (high - low), math.inf)
+        centre = self.point_world(every, centre).detach()
+        turned = torch.einsum("nij,nj->ni", self.rotation.detach().abs(), half.nan_to_num())
+        reach = torch.where(bounded[:, None], turned * self.scale[:, None].detach(), math.inf)
+        near = self.solid[:, None] & (self.medium[:, None] == self.medium[None])
+        near &= every[:, None] != every[None]
+        for a in range(3):
+            gap = (centre[:, None, a] - centre[None, :, a]).abs()
+            near &= gap <= reach[:, None, a] + reach[None, :, a] + FLUSH
+        count = int(near.sum(1).max()) if len(self) else 0
+        order = torch.argsort(near, dim=1, descending=True, stable=True)[:, :count]
+        return torch.where(near.gather(1, order), order, -1)
+
+    def _depth(self, which: Tensor, patch: Tensor) -> Float[Tensor, "m"]:
+        """``depth_behind`` of each node's own shape, in the world [m]."""
+        depth = torch.zeros_like(self.scale[which])
+        for shape, i in self.groups(which):
+            depth = depth.index_copy(0, i, depth_behind(shape, patch[i]))
+        return depth * self.scale[which]
+
+
+FLUSH = 1e-8  # [m] faces this near to each other touch
 
 
 def unit(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
@@ -292,12 +437,6 @@ def unit(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
     zero = square == 0
     inverse = torch.where(zero, torch.zeros_like(square), torch.where(zero, 1.0, square).rsqrt())
     return vector * inverse
-
-
-def _take(crossing: Crossing, i: Tensor) -> Crossing:
-    return Crossing(
-        crossing.start[i], crossing.end[i], crossing.normal_start[i], crossing.normal_end[i]
-    )
 
 
 def _complex(which: Tensor, frequency: Tensor) -> Tensor:
@@ -343,3 +482,14 @@ def _surface_key(body: Body) -> tuple[object, Body]:
     if fitted or surface.kind == "stochastic":
         return (id(surface), id(body.shape)), body
     return (surface.kind, json.dumps(surface.config(), sort_keys=True)), body
+
+
+def _medium_key(body: Body) -> tuple[object, Body]:
+    """Solids of equal constants are one medium; while constants are being fitted, those that share
+    them. Whatever is no solid has no medium: one key for all."""
+    surface = body.surface
+    if not isinstance(surface, Solid):
+        return None, body
+    if any(p.requires_grad for p in surface.medium.parameters()):
+        return id(surface.medium), body
+    return json.dumps(surface.medium.config(), sort_keys=True), body

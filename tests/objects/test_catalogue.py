@@ -23,6 +23,7 @@ SURFACE_ARGUMENTS = {
     "conductor": {},
     "halfspace": {"itu": "concrete"},
     "slab": {"thickness_m": 0.1, "eps_r": 3.0, "sigma": 0.02},
+    "solid": {"eps_r": 3.0, "sigma": 0.02},
     "stochastic": {"m": 0.5, "bulk": 0.2},
 }
 
