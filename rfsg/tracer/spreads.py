@@ -201,7 +201,7 @@ def _coherence(
         found = _first_fall(weight[mine, k], at, number[link[mine]], rms[some, k], level)
         inf = torch.full_like(rms[:, k], torch.inf)
         columns.append(inf.index_copy(0, some, found))
-    return torch.stack(columns, -1).reshape(n_tx, n_rx, -1)
+    return torch.stack(columns, -1).reshape(n_tx, n_rx, weight.shape[1])
 
 
 def _first_fall(
