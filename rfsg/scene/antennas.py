@@ -99,7 +99,7 @@ def angles(direction: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b"], Float
     sine = _sine(direction)
     on_axis = sine < ON_AXIS
     x = torch.where(on_axis, torch.ones_like(x), x)
-    y = torch.where(on_axis, torch.zeros_like(y), y)
+    y = torch.where(on_axis, torch.zeros_like(y), y) + 0.0  # -0 would turn pi into -pi
     return torch.atan2(sine, z), torch.atan2(y, x)
 
 

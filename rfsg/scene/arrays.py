@@ -35,9 +35,7 @@ class Array:
     def __post_init__(self) -> None:
         if self.unit not in UNITS:
             raise SceneError([f"array: unit is {self.unit!r}; expected one of {', '.join(UNITS)}"])
-        if self.offsets.ndim != 2 or self.offsets.shape[1] != 3:
-            shape = tuple(self.offsets.shape)
-            raise SceneError([f"array: offsets have shape {shape}; expected (elements, 3)"])
+        _triples(self.offsets)
         _count(len(self.offsets))
         if not bool(torch.isfinite(self.offsets).all()):
             raise SceneError(["array: offsets hold numbers that are not finite"])
@@ -81,9 +79,11 @@ class Array:
     def of(offsets: Sequence[Sequence[float]], unit: str = "wavelength") -> "Array":
         """Elements at any places (x, y, z). SceneError for what is not triples of numbers."""
         try:
-            return Array(torch.tensor(offsets, dtype=torch.float64), unit)
+            places = torch.tensor(offsets, dtype=torch.float64)
         except (TypeError, ValueError) as error:
             raise SceneError([f"array: expected triples of numbers: {error}"]) from error
+        _triples(places)
+        return Array(places, unit)
 
     @staticmethod
     def from_csv(path: str | Path, unit: str = "wavelength") -> "Array":
@@ -117,6 +117,12 @@ class Array:
     def metres(self, wavelength: float) -> Float[Tensor, "n 3"]:
         """The offsets in metres, for the wavelength [m] that the unit refers to."""
         return self.offsets * wavelength if self.unit == "wavelength" else self.offsets
+
+
+def _triples(places: Tensor) -> None:
+    if places.ndim != 2 or places.shape[1] != 3:
+        shape = tuple(places.shape)
+        raise SceneError([f"array: offsets have shape {shape}; expected (elements, 3)"])
 
 
 def _count(elements: int) -> None:
