@@ -12,145 +12,22 @@ two and the phase of TE, which is the scalar wave's own (and right at normal and
 alike; an average of the two amplitudes would cancel at grazing, where they differ in sign).
 """
 
-from dataclasses import dataclass
-
 import torch
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
-from rfsg.objects.contract import Crossing
 from rfsg.scene.radios import Radio, amplitude, field_components
 from rfsg.scene.world import World, unit
 from rfsg.tracer.acting import Acting, dyad_of, scalar
 from rfsg.tracer.edges import Edges
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.implicit import segments
-from rfsg.tracer.march import EVALUATE, crossings
 from rfsg.tracer.mechanisms import COEFFICIENT, DYAD
+from rfsg.tracer.passages import Passages, passages
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.records import Channel, Crossings, Paths, Rays
+from rfsg.tracer.records import Channel, Paths
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
-OWN_RIPPLE = 0.25  # [wavelengths] along the normal: a path that leaves a learned face may graze it
-
-
-@dataclass(frozen=True)
-class Passages:
-    """What the segments of paths go through: flat, sorted by path segment, then by distance."""
-
-    path: Int[Tensor, "m"]
-    segment: Int[Tensor, "m"]
-    which: Int[Tensor, "m"]
-    crossing: Crossing
-
-
-@torch.no_grad()
-def passages(
-    world: World, proxies: Proxies, paths: Paths, wavelength: float, quality: Quality
-) -> Passages:
-    """Every crossing of every segment, less the grazing of a segment's own mirrors."""
-    p, k = paths.vertices.shape[:2]
-    length, u = segments(paths.vertices.detach())
-    path, segment = torch.nonzero(length > 0, as_tuple=True)
-    rays = Rays(paths.vertices.detach()[path, segment], u[path, segment], length[path, segment])
-    parts = []
-    for i in torch.arange(len(path), device=world.device).split(quality.chunk):
-        some = Rays(rays.origin[i], rays.direction[i], rays.limit[i])
-        parts.append((i, crossings(world, some, proxies.spans(some), EVALUATE)))
-    if not parts:
-        return _empty(world)
-    inside = Crossings(
-        torch.cat([i[c.ray] for i, c in parts]),
-        *(
-            torch.cat([getattr(c, n) for _, c in parts])
-            for n in list(Crossings.__dataclass_fields__)[1:]
-        ),
-    )
-    keep = ~_own(world, paths, path, segment, rays, inside, wavelength)
-    i = torch.nonzero(keep).squeeze(-1)
-    ray = inside.ray[i]
-    o, d = rays.origin[ray], rays.direction[ray]
-    leave = torch.where(torch.isfinite(inside.leave[i]), inside.leave[i], inside.enter[i])
-    return Passages(
-        path[ray],
-        segment[ray],
-        inside.which[i],
-        Crossing(
-            o + inside.enter[i, None] * d,
-            o + leave[:, None] * d,
-            inside.normal_enter[i],
-            inside.normal_leave[i],
-        ),
-    )
-
-
-def _empty(world: World) -> Passages:
-    none = torch.zeros(0, dtype=torch.int64, device=world.device)
-    point = torch.zeros(0, 3, dtype=torch.float64, device=world.device)
-    return Passages(none, none, none, Crossing(point, point, point, point))
-
-
-def _own(
-    world: World,
-    paths: Paths,
-    path: Tensor,
-    segment: Tensor,
-    rays: Rays,
-    inside: Crossings,
-    wavelength: float,
-) -> Bool[Tensor, "m"]:
-    """Crossings of the object that a segment's own end reflects on.
-
-    A reflected ray never crosses the convex object it left. A learned face ripples about the surface
-    that the wave sees, so a stretch that touches the vertex and stays within a fraction of a
-    wavelength of the face is the mirror itself, not a passage through it.
-    """
-    ray = inside.ray
-    p, s = path[ray], segment[ray]
-    depth = paths.which.shape[1]
-    own = torch.zeros(len(ray), dtype=torch.bool, device=world.device)
-    if not depth:
-        return own
-    none = torch.full((len(paths.which), 1), -1, dtype=torch.int64, device=world.device)
-    reflecting = torch.cat([none, paths.which, none], 1)  # by vertex
-    normals = torch.nn.functional.pad(paths.normal.detach(), (0, 0, 1, 1))
-    length = rays.limit[ray]
-    for vertex, near, far in (
-        (s, inside.enter, inside.leave),
-        (s + 1, length - inside.leave, length - inside.enter),
-    ):
-        mine = (reflecting[p, vertex] == inside.which) & (inside.which >= 0)
-        cosine = (rays.direction[ray] * normals[p, vertex]).sum(-1).abs()
-        shallow = far * cosine <= OWN_RIPPLE * wavelength
-        touching = near * cosine <= OWN_RIPPLE * wavelength
-        own |= mine & (world.convex[inside.which] | (shallow & touching))
-    return own
-
-
-def with_gradient(world: World, passages: Passages) -> Passages:
-    """The same crossings, whose ends move with what they lie on.
-
-    t' = t - f(p(t)) / (grad f . d), with the slope held fixed (implicit function theorem).
-    """
-    if not torch.is_grad_enabled() or not len(passages.path):
-        return passages
-    crossing = passages.crossing
-    direction = unit(crossing.end - crossing.start).detach()
-    start = _on_surface(world, passages.which, crossing.start, crossing.normal_start, direction)
-    end = _on_surface(world, passages.which, crossing.end, crossing.normal_end, direction)
-    moved = Crossing(start, end, crossing.normal_start, crossing.normal_end)
-    return Passages(passages.path, passages.segment, passages.which, moved)
-
-
-def _on_surface(
-    world: World, which: Tensor, point: Tensor, normal: Tensor, direction: Tensor
-) -> Tensor:
-    on_boundary = normal.abs().sum(-1) > 0
-    value, gradient = world.value_and_gradient(which, point)
-    slope = (gradient * direction).sum(-1).detach()
-    safe = torch.where(slope.abs() < 1e-3, torch.ones_like(slope), slope)
-    move = torch.where(on_boundary & (slope.abs() >= 1e-3), value / safe, torch.zeros_like(value))
-    return point - move[:, None] * direction
 
 
 def channel(
@@ -169,7 +46,6 @@ def channel(
     """
     wavelength = SPEED_OF_LIGHT / frequency
     through = passages(world, proxies, paths, float(wavelength.min()), quality)
-    through = with_gradient(world, through)
     _, u = segments(paths.vertices)
     departure, arrival = u[:, 0], -_last(u, paths)
     scale = wavelength[None] / (4 * torch.pi) * paths.spread[:, None]
@@ -202,7 +78,7 @@ def channel(
         _doppler(world, paths, u, transmitters, receivers, frequency[0]),
         departure,
         arrival,
-        torch.stack([through.path, through.which, through.segment], -1),
+        through.crossed,
         blocked,
         jones,
     )
@@ -223,11 +99,15 @@ def _scalar(at: Acting, through: Passages) -> Complex[Tensor, "p f"]:
             factor = COEFFICIENT[act](at, i, level)
             product = product * torch.ones_like(product).index_copy(0, i, factor)
     if len(through.path):
-        factor = scalar(at.world.transmission(through.which, through.crossing, at.frequency))
+        factor = scalar(_transmission(at, through))
         for slot in _slots(through.path):
             i = through.path[slot]
             product = product * torch.ones_like(product).index_copy(0, i, factor[slot])
     return product
+
+
+def _transmission(at: Acting, through: Passages) -> Complex[Tensor, "m f 2"]:
+    return at.world.transmission(through.which, through.crossing, at.frequency, through.last)
 
 
 def _slots(path: Int[Tensor, "m"]) -> list[Tensor]:
@@ -254,11 +134,7 @@ def _jones(
     paths, u = at.paths, at.u
     sent = _basis(transmitters, paths.tx, u[:, 0])
     field = sent.mT[:, None].to(torch.complex128).expand(-1, len(at.frequency), -1, -1)
-    transmission = (
-        at.world.transmission(through.which, through.crossing, at.frequency)
-        if len(through.path)
-        else None
-    )
+    transmission = _transmission(at, through) if len(through.path) else None
     for level in range(paths.which.shape[1] + 1):
         if transmission is not None:
             here = torch.nonzero(through.segment == level).squeeze(-1)
@@ -349,7 +225,7 @@ def _excess(world: World, paths: Paths, through: Passages, frequency: Tensor) ->
     total = torch.zeros(len(paths.tx), dtype=torch.float64, device=world.device)
     if not len(through.path):
         return total
-    excess = world.excess_delay(through.which, through.crossing, frequency[:1])[:, 0]
+    excess = world.excess_delay(through.which, through.crossing, frequency[:1], through.last)[:, 0]
     return total.index_add(0, through.path, excess)
 
 

@@ -134,6 +134,25 @@ class Paths:
     caustics: Int[Tensor, "p"]
     status: Int[Tensor, "p"]
 
+    def runs_in(self) -> Int[Tensor, "p s"]:
+        """The solid that each segment runs in, refracted; -1 in free space and along straight paths.
+
+        From an ENTER to the next LEAVE; before a first LEAVE, and after a last ENTER, a radio is inside.
+        """
+        depth, none = self.which.shape[1], torch.full_like(self.tx, -1)
+        after, before = [none], [none]
+        for k in range(depth):
+            after.append(self._past(k, Act.ENTER, Act.LEAVE, after[-1]))
+            before.append(self._past(depth - 1 - k, Act.LEAVE, Act.ENTER, before[-1]))
+        return torch.maximum(torch.stack(after, 1), torch.stack(before[::-1], 1))
+
+    def _past(self, level: int, enter: Act, leave: Act, inside: Tensor) -> Int[Tensor, "p"]:
+        """The solid on the other side of a vertex."""
+        act, which = self.act[:, level], self.which[:, level]
+        met = which >= 0
+        inside = torch.where(met & (act == leave), -1, inside)
+        return torch.where(met & (act == enter), which, inside)
+
     def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "p"]) -> "Paths":
         """Some of the paths."""
         return Paths(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
