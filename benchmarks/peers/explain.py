@@ -1,0 +1,205 @@
+"""Why the peer has another number: each cause with the rule that recognises it.
+
+A rule does not look at the case's name. It computes what the cause would do to this very path, from
+rfsg's path or from the closed form, and asks whether that is what was found.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import truth
+from cases import Ball, Wall
+from differences import THRESHOLD, Compared, Difference, decibel
+
+C = 299_792_458.0
+SHORTEST = 1e-2  # [m] constants.py of Sionna RT 2.2: MIN_SEGMENT_LENGTH
+FLOAT32 = float(np.finfo(np.float32).eps)
+ROUNDINGS = 8  # of float32, that a delay may have gone through
+
+
+@dataclass(frozen=True)
+class Cause:
+    name: str
+    why: str
+    explains: Callable[[Compared, Difference], bool]
+
+
+def _segments(c: Compared, p: int) -> np.ndarray:
+    rx = np.array(c.case.receivers[c.rfsg.rx[p]])
+    line = c.rfsg.polyline(p, np.array(c.case.transmitter), rx)
+    return np.linalg.norm(np.diff(line, axis=0), axis=1)
+
+
+def short_segment(c: Compared, d: Difference) -> bool:
+    """A path with a segment under a centimetre is missing, or a link lacks just such paths."""
+    if d.quantity == "missing in the peer":
+        return bool(_segments(c, d.p).min() < SHORTEST)
+    if d.quantity != "link power [dB]":
+        return False
+    lost = {x.p for x in c.differences if x.quantity == "missing in the peer" and x.rx == d.rx}
+    if not lost or not all(_segments(c, p).min() < SHORTEST for p in lost):
+        return False
+    mine = [p for p in np.nonzero(c.rfsg.rx == d.rx)[0] if p not in lost]
+    left = abs(c.rfsg.share(c.case.frequency)[mine].sum())
+    return abs(c.link_power(c.peer)[d.rx] - decibel(left)) < THRESHOLD[d.quantity]
+
+
+def _walls(c: Compared, d: Difference) -> list[tuple[float, float]]:
+    """(thickness, |cos|) of the walls that a path without bounces goes through."""
+    if d.p < 0 or not c.rfsg.crossed[d.p]:
+        return []
+    walls = [t for t in c.case.standing() if isinstance(t, Wall)]
+    axes = ["xyz".index(w.front[1]) for w in walls]
+    return [
+        (w.thickness, abs(float(c.rfsg.departure[d.p][a])))
+        for w, a in zip(walls, axes, strict=True)
+    ]
+
+
+def slab_delay(c: Compared, d: Difference) -> bool:
+    """The peer's delay is the straight length over c; the closed form's holds the group delay."""
+    if d.quantity != "delay [ns]" or not _walls(c, d) or c.truth is None:
+        return False
+    straight = _segments(c, d.p).sum() / C
+    exact = c.truth.delay[c.truth_of[d.p]]
+    return max(abs(c.peer.delay[d.s] - straight), abs(c.rfsg.delay[d.p] - exact)) < 1e-12
+
+
+def slab_phase(c: Compared, d: Difference) -> bool:
+    """Off by exactly -k d cos(theta): the way through the wall is counted twice."""
+    walls = _walls(c, d)
+    if d.quantity != "phase [deg]" or not walls:
+        return False
+    twice = sum(thickness * cosine for thickness, cosine in walls)
+    expected = -360.0 * c.case.frequency / C * twice
+    return abs((d.value - expected + 180.0) % 360.0 - 180.0) < THRESHOLD[d.quantity]
+
+
+def float32_phase(c: Compared, d: Difference) -> bool:
+    """The delay agrees to float32's last places, and that much of it is the phase's difference."""
+    f = c.case.frequency
+    if d.quantity == "phase [deg]":
+        error = c.peer.delay[d.s] - c.rfsg.delay[d.p]
+        turned = (d.value + 360.0 * f * error + 180.0) % 360.0 - 180.0
+        allowed = ROUNDINGS * FLOAT32 * c.rfsg.delay[d.p]
+        return bool(abs(error) < allowed and abs(turned) < THRESHOLD[d.quantity])
+    if d.quantity == "delay [ns]":
+        return abs(d.value) * 1e-9 < ROUNDINGS * FLOAT32 * c.rfsg.delay[d.p]
+    if d.quantity != "link power [dB]":
+        return False
+    mine = [(p, s) for p, s in c.pairs if c.rfsg.rx[p] == d.rx]
+    if len(mine) != int((c.rfsg.rx == d.rx).sum()):
+        return False
+    p, s = np.array(mine).T
+    turn = np.exp(-2j * np.pi * np.mod(f * c.rfsg.delay[p], 1.0))
+    mended = decibel(np.array(abs((c.peer.gain[s] * turn).sum())))
+    return bool(abs(mended - c.link_power(c.rfsg)[d.rx]) < THRESHOLD[d.quantity])
+
+
+def float32_vertices(c: Compared, d: Difference) -> bool:
+    """The closed form over the peer's own vertices has the peer's power: they are that far off."""
+    if d.quantity != "power [dB]" or c.truth is None or _on_ball(c, d):
+        return False
+    rx = np.array(c.case.receivers[d.rx])
+    points = c.peer.polyline(d.s, np.array(c.case.transmitter), rx)
+    items = c.rfsg.item[d.p][c.rfsg.kind[d.p] >= 0]
+    there = truth.gain_along(c.case, items, points)
+    return bool(abs(decibel(there) - decibel(c.peer.gain[d.s])) < THRESHOLD[d.quantity] / 10)
+
+
+def _on_ball(c: Compared, d: Difference) -> Ball | None:
+    traced, p = (c.rfsg, d.p) if d.p >= 0 else (c.peer, d.s)
+    ball = c.case.things[0]
+    met = p >= 0 and (traced.kind[p] >= 0).any()
+    return ball if met and isinstance(ball, Ball) else None
+
+
+def flat_facets(c: Compared, d: Difference) -> bool:
+    """On a ball made of triangles: no triangle is met at the right angle, or one is, and it spreads
+    the wave as a plane mirror does, lambda / 4 pi L. Links follow from their paths."""
+    if d.quantity == "link power [dB]":
+        rest = [x for x in c.differences if x.rx == d.rx and x is not d]
+        return bool(rest) and all(flat_facets(c, x) for x in rest)
+    ball = _on_ball(c, d)
+    if ball is None:
+        return False
+    tx, rx = np.array(c.case.transmitter), np.array(c.case.receivers[d.rx])
+    if d.quantity == "missing in the peer":
+        return truth.mirroring_facets(ball, tx, rx) == 0
+    if d.quantity == "power [dB]":
+        s1, s2 = _segments(c, d.p)
+        cosine = np.sqrt((1 - c.rfsg.departure[d.p] @ -c.rfsg.arrival[d.p]) / 2)
+        flat = 1 / (s1 + s2) / truth.divergence(s1, s2, cosine, ball.radius)
+        return bool(abs(d.value - decibel(flat)) < 0.25 * abs(d.value))
+    if d.quantity in ("delay [ns]", "phase [deg]"):
+        shift = abs(c.peer.delay[d.s] - c.rfsg.delay[d.p])
+        return bool(shift * C <= 2 * 2 * sagitta(ball))
+    return False
+
+
+def sagitta(ball: Ball) -> float:
+    """How far the middle of a triangle lies below the ball [m]: side^2 / 6 r, half as much again
+    for the largest triangles of an icosphere."""
+    side_square = 4 * np.pi * ball.radius**2 / ball.facets * 4 / np.sqrt(3)
+    return 1.5 * side_square / (6 * ball.radius)
+
+
+CAUSES = (
+    Cause(
+        "short segment",
+        "Sionna RT drops every path with a segment under 1 cm (`MIN_SEGMENT_LENGTH` in its "
+        "`constants.py`): here two bounces that near an edge. A link that lacks only such paths "
+        "has the power of rfsg's other paths. rfsg keeps them.",
+        short_segment,
+    ),
+    Cause(
+        "delay of a wall",
+        "The peer's delay through a wall is the straight length over c. A wave takes longer in "
+        "the wall: rfsg adds the group delay of the slab, and equals the derivative of the closed "
+        "form's phase.",
+        slab_delay,
+    ),
+    Cause(
+        "wall counted twice",
+        "P.2040's transmission coefficient is from face to face: it holds the way through the "
+        "thickness d. The path's length holds it too, so the peer's phase is off by "
+        "-k d cos(theta), even where the wall is of vacuum, which should do nothing (case `wall of "
+        "vacuum`). rfsg refers the coefficient to free space over the same stretch. Power of a "
+        "single path is not touched; sums of paths are.",
+        slab_phase,
+    ),
+    Cause(
+        "float32",
+        "The peer computes lengths and delays in float32, 24 bits: the delay is right to a few of "
+        "its last places, and the phase is off by 2 pi f times that. With rfsg's delays and the "
+        "peer's own amplitudes the power of the link agrees. Here the phase is even formed in "
+        "float64 from the peer's delay.",
+        float32_phase,
+    ),
+    Cause(
+        "float32 vertices",
+        "The peer's vertices are off by hundredths of a millimetre; between two that lie "
+        "centimetres apart this turns the direction, and with it the angle at which a coefficient "
+        "is taken. The closed form over the peer's own vertices gives the peer's power.",
+        float32_vertices,
+    ),
+    Cause(
+        "flat facets",
+        "A mesh's triangle is a plane mirror. Most receivers see themselves in none, the rest in "
+        "one that sends on lambda / (4 pi L), as if the ball were flat; its point lies as far off "
+        "the ball as a triangle cuts in. More triangles make hits no better and no more frequent. "
+        "rfsg's ball has a curvature, one path for each receiver, and the divergence factor of "
+        "geometrical optics.",
+        flat_facets,
+    ),
+)
+UNEXPLAINED = "UNEXPLAINED"
+
+
+def cause_of(compared: Compared, difference: Difference) -> str:
+    """Name of the first cause that explains a difference."""
+    for cause in CAUSES:
+        if cause.explains(compared, difference):
+            return cause.name
+    return UNEXPLAINED

@@ -1,0 +1,295 @@
+"""Closed forms to hold both sides against: plain numpy in float64, slow, short, and no tracer.
+
+Flat scenes: the image method (Allen & Berkley 1979, for any rectangles), with exact blocking. Sphere:
+the divergence factor of geometrical optics (Balanis 2012, section 13.3). Coefficients: the single
+layer of Recommendation ITU-R P.2040-4 section 2.2.2. Time convention exp(+j 2 pi f t).
+"""
+
+from itertools import product
+
+import numpy as np
+from cases import Ball, Case, Thing, Wall
+from exchange import REFLECT, Traced
+from numpy import ndarray
+
+C = 299_792_458.0  # [m/s]
+EPS0 = 8.8541878188e-12  # [F/m], CODATA 2022
+ITU = {  # P.2040-4 Table 3: eps_r = a f^b, sigma = c f^d [S/m], f in GHz, below 40 GHz
+    "concrete": (5.24, 0.0, 0.0462, 0.7822),
+    "brick": (3.91, 0.0, 0.0238, 0.16),
+    "wood": (1.99, 0.0, 0.0047, 1.0718),
+    "glass": (6.31, 0.0, 0.0036, 1.3394),
+    "marble": (7.074, 0.0, 0.0055, 0.9262),
+    "vacuum": (1.0, 0.0, 0.0, 0.0),
+    "metal": (1.0, 0.0, 1e7, 0.0),
+}
+INSIDE = 1e-9  # [m] how far beyond a rectangle's edge still counts as on it
+
+
+def permittivity(itu: str, frequency: float) -> complex:
+    a, b, c, d = ITU[itu]
+    f = frequency / 1e9
+    return a * f**b - 1j * c * f**d / (2 * np.pi * frequency * EPS0)
+
+
+def layer(cosine: ndarray | float, eps: complex, thickness: float, frequency: float) -> ndarray:
+    """[4 ...]: R_TE, R_TM, T_TE, T_TM of one layer, from face to face, at cos(incidence)."""
+    k = 2 * np.pi * frequency / C
+    root = np.sqrt(eps - (1 - cosine**2) + 0j)
+    through = np.exp(-1j * k * thickness * root)  # once through the layer
+    out = []
+    for r in (
+        (cosine - root) / (cosine + root),
+        (eps * cosine - root) / (eps * cosine + root),
+    ):
+        loop = 1 - r**2 * through**2
+        out.append((r * (1 - through**2) / loop, (1 - r**2) * through / loop))
+    return np.array([out[0][0], out[1][0], out[0][1], out[1][1]])
+
+
+def theta_hat(direction: ndarray) -> ndarray:
+    """Unit vector of growing angle from +z at a unit direction: vertical polarisation."""
+    flat = np.hypot(direction[0], direction[1])
+    x, y = (1.0, 0.0) if flat == 0 else direction[:2] / flat
+    return np.array([direction[2] * x, direction[2] * y, -flat])
+
+
+def _bent(field: ndarray, k: ndarray, onward: ndarray, n: ndarray, te, tm) -> ndarray:
+    """A field vector after a boundary: s across the plane of incidence, p = s x k within it."""
+    s = np.cross(k, n)
+    if s @ s < 1e-24:
+        s = np.cross(k, np.eye(3)[np.argmin(np.abs(k))])
+    s = s / np.linalg.norm(s)
+    return te * s * (s @ field) + tm * np.cross(s, onward) * (np.cross(s, k) @ field)
+
+
+# flat scenes
+
+
+class _Faces:
+    """All rectangles of a scene: corner, u, v, n [m 3], owner [m], one-sided [m]."""
+
+    def __init__(self, things: tuple[Thing, ...]):
+        flat = [(i, f) for i, t in enumerate(things) for f in t.faces()]
+        self.owner = np.array([i for i, _ in flat], int)
+        self.corner, self.u, self.v = np.stack([f for _, f in flat], 1)
+        n = np.cross(self.u, self.v)
+        self.n = n / np.linalg.norm(n, axis=1, keepdims=True)
+        self.sheet = np.array([isinstance(things[i], Wall) for i in self.owner])
+
+    def mirror(self, face: ndarray, point: ndarray) -> ndarray:
+        height = ((point - self.corner[face]) * self.n[face]).sum(-1, keepdims=True)
+        return point - 2 * height * self.n[face]
+
+    def meet(self, face: ndarray, start: ndarray, end: ndarray) -> tuple[ndarray, ndarray]:
+        """Where lines from start to end meet the faces' planes, and whether within the faces and
+        strictly between the ends."""
+        a = ((start - self.corner[face]) * self.n[face]).sum(-1)
+        b = ((end - self.corner[face]) * self.n[face]).sum(-1)
+        parallel = a == b
+        t = np.where(parallel, -1.0, a / np.where(parallel, 1.0, a - b))
+        point = start + t[..., None] * (end - start)
+        within = (t > 0) & (t < 1)
+        for edge in (self.u, self.v):
+            length = np.linalg.norm(edge[face], axis=-1)
+            along = ((point - self.corner[face]) * edge[face]).sum(-1) / length
+            within &= (along > -INSIDE) & (along < length + INSIDE)
+        return point, within
+
+
+def gain_along(case: Case, items: ndarray, points: ndarray) -> complex:
+    """What the closed form gives on a polyline [k 3] that bounces on ``items``, exact or not."""
+    faces = _Faces(case.standing())
+    sequence = []
+    for item, point in zip(items, points[1:-1], strict=True):
+        off = np.abs(((point - faces.corner) * faces.n).sum(1))
+        sequence.append(np.where(faces.owner == item, off, np.inf).argmin())
+    row = _path(case, case.standing(), faces, np.array(sequence, int), points)
+    return 0j if row is None else row[2]
+
+
+def images(case: Case) -> Traced:
+    """Every path of a scene of rectangles, by the image method."""
+    things = case.standing()
+    faces = _Faces(things)
+    rows = []
+    for r, receiver in enumerate(np.array(case.receivers)):
+        for depth in range(case.depth + 1):
+            sequences = _sequences(len(faces.n), depth)
+            for sequence, points in _reflected(
+                faces, sequences, np.array(case.transmitter), receiver
+            ):
+                row = _path(case, things, faces, sequence, points)
+                if row is not None:
+                    rows.append((r, faces.owner[sequence], points[1:-1], *row))
+    return _traced(case, things, rows)
+
+
+def _sequences(count: int, depth: int) -> ndarray:
+    """[n depth]: all sequences of faces without the same one twice running."""
+    all_of = np.array(list(product(range(count), repeat=depth)), int).reshape(count**depth, depth)
+    return all_of[(all_of[:, 1:] != all_of[:, :-1]).all(1)]
+
+
+def _reflected(faces: _Faces, sequences: ndarray, tx: ndarray, rx: ndarray):
+    """(sequence, [d+2 3] points) of those whose images see each other through their faces."""
+    depth = sequences.shape[1]
+    image = [np.broadcast_to(tx, (len(sequences), 3))]
+    for level in range(depth):
+        image.append(faces.mirror(sequences[:, level], image[-1]))
+    points = np.empty((len(sequences), depth + 2, 3))
+    points[:, 0], points[:, -1] = tx, rx
+    good = np.ones(len(sequences), bool)
+    for level in range(depth, 0, -1):
+        face = sequences[:, level - 1]
+        points[:, level], within = faces.meet(face, points[:, level + 1], image[level])
+        good &= within
+    for i in np.nonzero(good)[0]:
+        before, after = points[i, :-2] - points[i, 1:-1], points[i, 2:] - points[i, 1:-1]
+        n = faces.n[sequences[i]]
+        sides = (before * n).sum(1), (after * n).sum(1)
+        front = (sides[0] > 0) & (sides[1] > 0)
+        back = (sides[0] < 0) & (sides[1] < 0) & faces.sheet[sequences[i]]
+        if (front | back).all():
+            yield sequences[i], points[i]
+
+
+def _path(case: Case, things, faces: _Faces, sequence: ndarray, points: ndarray):
+    """(crossed, delay, gain, departure, arrival) of one path; None where it is blocked."""
+    step = np.diff(points, axis=0)
+    length = np.linalg.norm(step, axis=1)
+    k = step / length[:, None]
+    field = theta_hat(k[0]).astype(complex)
+    crossed, excess = 0, 0.0
+    for s in range(len(k)):
+        own = sequence[max(s - 1, 0) : s + 1]
+        for face in np.nonzero(faces.meet(np.arange(len(faces.n)), points[s], points[s + 1])[1])[0]:
+            if face in own:
+                continue
+            if not (faces.sheet[face] and case.refraction):
+                return None
+            n, thing = faces.n[face], things[faces.owner[face]]
+            cosine = abs(k[s] @ n)
+            te, tm, _, delay = _crossing(thing, cosine, case.frequency)
+            field = _bent(field, k[s], k[s], n, te, tm)
+            excess += delay
+            crossed += 1
+        if s < len(sequence):
+            n, thing = faces.n[sequence[s]], things[faces.owner[sequence[s]]]
+            eps = permittivity(thing.itu, case.frequency)
+            te, tm, _, _ = layer(abs(k[s] @ n), eps, thing.thickness, case.frequency)
+            field = _bent(field, k[s], k[s + 1], n, te, tm)
+    total = length.sum()
+    gain = (theta_hat(-k[-1]) @ field) * C / case.frequency / (4 * np.pi * total)
+    gain *= np.exp(2j * np.pi * np.mod(case.frequency * excess, 1.0))
+    return crossed, total / C + excess, gain, k[0], -k[-1]
+
+
+def _crossing(thing: Thing, cosine: float, frequency: float):
+    """T_TE, T_TM and their phase relative to free space over the same stretch, and the group delay
+    of TE beyond it [s].
+
+    A path's length counts the thickness; T of the layer holds the travel through it too. Both
+    together would count it twice, so T is divided by exp(-j k d cos).
+    """
+
+    def relative(f: float) -> ndarray:
+        te, tm = layer(cosine, permittivity(thing.itu, f), thing.thickness, f)[2:]
+        return np.array([te, tm]) * np.exp(2j * np.pi * f / C * thing.thickness * cosine)
+
+    step = 1e4  # [Hz]
+    te, tm = relative(frequency)
+    turn = np.angle(relative(frequency + step)[0] / relative(frequency - step)[0])
+    return te, tm, np.angle(te), -turn / (4 * np.pi * step)
+
+
+# sphere
+
+
+def sphere(case: Case) -> Traced:
+    """Line of sight and the one glint on a ball, for every receiver on its lit side."""
+    (ball,) = case.things
+    assert isinstance(ball, Ball)
+    centre, tx = np.array(ball.centre), np.array(case.transmitter)
+    eps = permittivity(ball.itu, case.frequency)
+    rows = []
+    for r, rx in enumerate(np.array(case.receivers)):
+        u = rx - tx
+        near = tx + u * np.clip((centre - tx) @ u / (u @ u), 0, 1)
+        wave = C / case.frequency / (4 * np.pi)
+        none = np.zeros(0, int), np.zeros((0, 3))
+        if np.linalg.norm(near - centre) > ball.radius:
+            distance = np.linalg.norm(u)
+            k = u / distance
+            gain = theta_hat(k) @ theta_hat(-k) * wave / distance
+            rows.append((r, *none, 0, distance / C, gain, k, -k))
+        glint, n = _glint(centre, ball.radius, tx, rx)
+        s1, s2 = float(np.linalg.norm(glint - tx)), float(np.linalg.norm(rx - glint))
+        k, onward = (glint - tx) / s1, (rx - glint) / s2
+        cosine = -float(k @ n)
+        spread = divergence(s1, s2, cosine, ball.radius)
+        te, tm, _, _ = layer(cosine, eps, ball.thickness, case.frequency)
+        field = _bent(theta_hat(k).astype(complex), k, onward, n, te, tm)
+        gain = (theta_hat(-onward) @ field) * wave * spread
+        rows.append((r, np.array([0]), glint[None], 0, (s1 + s2) / C, gain, k, -onward))
+    return _traced(case, case.things, rows)
+
+
+def divergence(s1: float, s2: float, cosine: float, radius: float) -> float:
+    """Amplitude [1/m] after a ball: s1 to it, s2 from it (Kouyoumjian & Pathak 1974, eqs. 25-27)."""
+    a, b = 1 / (1 / s1 + 2 / (radius * cosine)), 1 / (1 / s1 + 2 * cosine / radius)
+    return np.sqrt(a * b / ((a + s2) * (b + s2))) / s1
+
+
+def mirroring_facets(ball: Ball, tx: ndarray, rx: ndarray) -> int:
+    """How many triangles of the ball's mesh show the transmitter to the receiver as a mirror does."""
+    a, b, c = ball.triangles().transpose(1, 0, 2)
+    n = np.cross(b - a, c - a)
+    n = n / np.linalg.norm(n, axis=1, keepdims=True)
+    height, above = (((p - a) * n).sum(1) for p in (tx, rx))
+    point = tx + (height / (height + above))[:, None] * (rx - 2 * above[:, None] * n - tx)
+    sides = [(np.cross(q - p, point - p) * n).sum(1) > 0 for p, q in ((a, b), (b, c), (c, a))]
+    return int(((height > 0) & (above > 0) & np.all(sides, 0)).sum())
+
+
+def _glint(centre: ndarray, radius: float, tx: ndarray, rx: ndarray) -> tuple[ndarray, ndarray]:
+    """The shortest way over the sphere's lit side: bisection on the angle between the two radii."""
+    a, b = tx - centre, rx - centre
+    e1 = a / np.linalg.norm(a)
+    e2 = b - (b @ e1) * e1
+    e2 /= np.linalg.norm(e2)
+    low, high = 0.0, np.arctan2(b @ e2, b @ e1)
+    for _ in range(100):
+        angle = (low + high) / 2
+        n = np.cos(angle) * e1 + np.sin(angle) * e2
+        p = centre + radius * n
+        along = np.cross(np.cross(e1, e2), n)  # of growing angle
+        slope = along @ ((p - tx) / np.linalg.norm(p - tx) + (p - rx) / np.linalg.norm(p - rx))
+        low, high = (angle, high) if slope < 0 else (low, angle)
+    return p, n
+
+
+def _traced(case: Case, things: tuple[Thing, ...], rows: list) -> Traced:
+    deep = max(1, case.depth)
+    item = np.full((len(rows), deep), -1)
+    vertex = np.full((len(rows), deep, 3), np.nan)
+    for p, row in enumerate(rows):
+        item[p, : len(row[1])], vertex[p, : len(row[1])] = row[1], row[2]
+    rx, _, _, crossed, delay, gain, departure, arrival = zip(*rows, strict=True)
+    return Traced(
+        names=np.array([t.name for t in things]),
+        rx=np.array(rx),
+        kind=np.where(item >= 0, REFLECT, -1),
+        item=item,
+        vertex=vertex,
+        crossed=np.array(crossed),
+        delay=np.array(delay),
+        gain=np.array(gain, complex),
+        departure=np.stack(departure),
+        arrival=np.stack(arrival),
+    )
+
+
+def solve(case: Case) -> Traced:
+    """The closed form of whichever kind of scene this is."""
+    return sphere(case) if any(isinstance(t, Ball) for t in case.things) else images(case)
