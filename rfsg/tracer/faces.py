@@ -69,6 +69,11 @@ class Samples:
 @torch.no_grad()
 def planes_of(world: World) -> Planes:
     """Every planar face in the world; a face reaches as far as its object's bounds."""
+    return moving_planes_of(world)
+
+
+def moving_planes_of(world: World) -> Planes:
+    """The same, differentiable in poses and sizes."""
     tables = {id(n.body.shape): n.body.shape.planes() for n in world.scene.nodes}
     rows = [tables[id(n.body.shape)].to(world.translation) for n in world.scene.nodes]
     each = [torch.arange(len(table), device=world.device) for table in rows]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from rfsg.tracer import acting, diffraction
+from rfsg.tracer import acting, diffraction, scatter
 from rfsg.tracer.acting import Acting
 from rfsg.tracer.records import Act
 
@@ -13,8 +13,10 @@ Rule = Callable[[Acting, Tensor, int], Tensor]  # (at, rows of paths, level) -> 
 COEFFICIENT: dict[Act, Rule] = {
     Act.REFLECT: acting.reflection,
     Act.DIFFRACT: diffraction.coefficient,
+    Act.SCATTER: scatter.coefficient,
 }
 DYAD: dict[Act, Rule] = {
     Act.REFLECT: acting.reflection_dyad,
     Act.DIFFRACT: diffraction.dyad,
+    Act.SCATTER: scatter.dyad,
 }

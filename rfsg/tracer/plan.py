@@ -14,8 +14,8 @@ class Quality:
     curved_depth: most reflections in all on a path that has a curved or learned face.
     diffraction: most edges that a path bends round: 0, 1 or 2.
     diffraction_depth: most interactions in all on a path that bends round one edge.
-    diffuse: tiles per face and direction
-        from which rough surfaces scatter (0: none). refraction: solids bend what goes through them.
+    diffuse: tiles per face and direction, at least, from which rough surfaces scatter (0: none).
+    phase_seed: which draw of the tiles' random phases. refraction: solids bend what goes through them.
     search: "auto" enumerates all sequences of faces where the scene is small enough (nothing can be
         missed) and launches rays elsewhere; "enumerate" or "rays" insist.
     rays: directions launched from each transmitter (Fibonacci lattice).
@@ -36,6 +36,7 @@ class Quality:
     diffraction: int = 0
     diffraction_depth: int = 2
     diffuse: int = 0
+    phase_seed: int = 0
     refraction: bool = True
     search: str = "auto"
     rays: int = 20_000
@@ -131,5 +132,13 @@ def make_plan(world: World, quality: Quality) -> Plan:
         left_out.append("Doppler: nothing moves")
     if not quality.diffraction:
         left_out.append("edge diffraction: not asked for (diffraction=0)")
+    rough = any(n.body.scattering is not None for n in scene.nodes)
+    if not quality.diffuse:
+        kept = "; mirrors do without the share all the same" * rough
+        left_out.append(f"diffuse reflection: not asked for (diffuse=0){kept}")
+    elif not (rough or bool(world.learned_surface.any())):
+        left_out.append("diffuse reflection: no surface of the scene scatters")
+    elif not quality.depth:
+        left_out.append("diffuse reflection: the depth asked for is 0")
     left_out.append(f"paths more than {-quality.floor_db:g} dB below free space of their length")
     return Plan(quality, tuple(modelled), tuple(left_out))

@@ -14,7 +14,7 @@ from torch import Tensor
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
-from rfsg.tracer import diffraction, validity
+from rfsg.tracer import diffraction, scatter, validity
 from rfsg.tracer import field as fields
 from rfsg.tracer.channel import Link, links, transfer
 from rfsg.tracer.edges import edges_in
@@ -97,6 +97,8 @@ def simulate(
             if quality.diffraction:
                 edges = edges_in(world, wavelength)
                 more.append(diffraction.paths_of(world, edges, tx, rx, wavelength, quality))
+            if bool(scatter.rough_nodes(world).any()):
+                more.append(scatter.paths_of(world, tx, rx, quality))
             paths = Paths.joined([paths, *(p for found in more for p in found.paths)])
             for found in more:
                 counts = Counter(counts) + Counter(found.counts)
@@ -123,7 +125,8 @@ def simulate(
 def world_for(scene: Scene, quality: Quality, device: torch.device | str) -> World:
     """The scene as tensors, its crossings integrated as the quality says."""
     samples, integral = quality.crossing_samples, quality.integral
-    return World(scene, device, samples=samples, integral=integral)
+    diffuse = quality.diffuse > 0
+    return World(scene, device, samples=samples, integral=integral, diffuse=diffuse)
 
 
 @contextmanager
@@ -169,12 +172,13 @@ def _above_floor(
     """Drop what is opaque or below the floor, and count it.
 
     Where radios are polarised the Jones matrix decides: a path that the reference ports do not see
-    (two +45 slants that face each other) is the whole channel of other ports.
+    (two +45 slants that face each other) is the whole channel of other ports. The tiles of one
+    object, which are shares of one path, count together.
     """
     wavelength = SPEED_OF_LIGHT / channel.frequency
     free = wavelength[None] / (4 * math.pi) / paths.length.clamp(min=1e-300)[:, None]
     strength = channel.gain.abs() if channel.jones is None else channel.jones.abs().amax((2, 3))
-    loss = (strength.detach() / free.detach()).amax(1)
+    loss = scatter.together(paths, (strength.detach() / free.detach()).amax(1))
     weak = loss < 10.0 ** (quality.floor_db / 20.0)
     drop = weak | channel.blocked
     keep = torch.nonzero(~drop).squeeze(-1)
