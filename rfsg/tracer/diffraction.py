@@ -34,6 +34,7 @@ from rfsg.tracer.sequences import Budget, Prefixes, TooMany, levels
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
 ROUNDS = 30  # Newton steps; the length is convex along straight edges
+HALVINGS = 12
 SETTLED = 1e-12  # of the path's length: the last step of a converged edge point
 RIM_LOOKS = 90  # places round a rim at which stationary points are looked for
 SAME = 1e-9  # of the length: closer than this to an edge's end still belongs to it
@@ -361,17 +362,26 @@ class _Line:
 
 
 def _newton(some: Edges, t: Tensor, a: Tensor, b: Tensor) -> tuple[Tensor, Bool[Tensor, "c"]]:
+    """dL/dt = 0 from t; each step is halved until the slope falls, which Newton's direction allows."""
+    line = _Line(some, t, a, b)
     settled = torch.zeros(len(t), dtype=torch.bool, device=t.device)
     for _ in range(ROUNDS):
-        line = _Line(some, t, a, b)
         step = _solve(line.hessian, line.slope)
-        reach = torch.minimum(line.length[:, :-1], line.length[:, 1:]).amin(1, keepdim=True)
-        step = torch.maximum(torch.minimum(step, reach), -reach)
-        t = t - step
-        total = line.length.sum(1, keepdim=True)
+        share = torch.ones_like(t[:, :1])
+        for _ in range(HALVINGS):
+            ahead = _Line(some, t - share * step, a, b)
+            rises = ahead.slope.square().sum(1) > line.slope.square().sum(1)
+            if not bool(rises.any()):
+                break
+            share = torch.where(rises[:, None], 0.5 * share, share)
+        # what no halving mends has come to rest: its slope is rounding
+        share = torch.where(rises[:, None], torch.zeros_like(share), share)
+        t = t - share * step
+        line = _Line(some, t, a, b)
         rounding = 64 * 2.0**-52 * line.place.abs().amax((1, 2))
-        settled = step.abs().amax(1) <= SETTLED * total[:, 0] + rounding
-        if bool(settled.all()):
+        least = SETTLED * line.length.sum(1) + rounding
+        settled = step.abs().amax(1) <= least
+        if bool((settled | rises).all()):
             break
     return t, settled
 

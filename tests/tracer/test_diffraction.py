@@ -5,16 +5,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from scipy.optimize import minimize
 
 from rfsg.objects.body import Body
-from rfsg.objects.shapes.analytic import Box, Sphere
+from rfsg.objects.shapes.analytic import Box, Cylinder, Sphere
 from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World
+from rfsg.tracer import diffraction
 from rfsg.tracer.channel import coefficients
-from rfsg.tracer.edges import edges_in
+from rfsg.tracer.edges import Edges, edges_in
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Act
 from rfsg.tracer.simulate import simulate
@@ -171,3 +173,79 @@ def test_gradients(count):
         h[k] = 1e-6
         expected = float(power(start + h) - power(start - h)) / 2e-6
         assert float(found[k]) == pytest.approx(expected, rel=1e-4, abs=1e-5)
+
+
+def _can(polarization, heights):
+    """Receivers behind a metal drum, by height [m] over the line that grazes its rim."""
+    drum = Node("/d", Body(Cylinder(0.6, 1.0), Conductor()), Pose.identity())
+    tx = radio("/t", -3.0, 0.0, 1.48, polarization=polarization)
+    # from the transmitter over the far rim (0.6, 0, 1): 0.48 down in 3.6 m, 0.96 m high at 0.9 m
+    rx = [
+        radio(f"/r{k}", 0.9, 0.0, 0.96 + h, polarization=polarization)
+        for k, h in enumerate(heights)
+    ]
+    quality = replace(QUALITY, curved=0)
+    return simulate(Scene((drum,), (tx,), tuple(rx)), F, quality)
+
+
+def test_points_on_a_rim_are_stationary_and_spread_by_its_curvature():
+    """Keller's cone at every point found, and S against the second derivative of the length."""
+    result = _can("V", [1.0, 2.0])
+    bent = torch.nonzero((result.paths.act == 1).any(1)).squeeze(-1)
+    assert len(bent) >= 4
+    for p in bent.tolist():
+        a, x, b = result.paths.vertices[p][:3]
+        centre = vector(0, 0, float(x[2]))
+
+        def length(turn, x=x, centre=centre, a=a, b=b):
+            c, s = math.cos(turn), math.sin(turn)
+            arm = x - centre
+            y = centre + torch.stack([c * arm[0] - s * arm[1], s * arm[0] + c * arm[1], arm[2]])
+            return float((y - a).norm() + (b - y).norm())
+
+        h = 1e-4
+        rise = (length(h) - length(-h)) / (2 * h)
+        bend = (length(h) - 2 * length(0.0) + length(-h)) / h**2 / 0.36
+        assert abs(rise) < 1e-7
+        u = (x - a) / (x - a).norm()
+        tangent = torch.linalg.cross(vector(0, 0, 1.0), (x - centre) / 0.6)
+        sine = float(torch.linalg.cross(u, tangent).norm())
+        expected = sine / (float((x - a).norm() * (b - x).norm()) * math.sqrt(abs(bend)))
+        assert float(result.paths.spread[p]) == pytest.approx(expected, rel=1e-5)
+        assert int(result.paths.caustics[p]) == int(bend < 0)
+
+
+@pytest.mark.parametrize("polarization", ["V", "H"])
+def test_no_step_where_the_direct_ray_grazes_a_rim(polarization):
+    h = _can(polarization, [-1e-4, -1e-7, 1e-7, 1e-4]).transfer()[0, :, 0]
+    assert abs(complex(h[2] - h[1])) <= 1e-3 * float(h.abs().max())
+
+
+def test_newton_finds_the_shortest_way_over_two_edges():
+    """Against scipy's minimiser, for random pairs of edges and ends."""
+    generator = torch.Generator().manual_seed(3)
+    start = torch.rand(60, 2, 3, dtype=torch.float64, generator=generator) * 4 - 2
+    along = torch.nn.functional.normalize(
+        torch.rand(60, 2, 3, dtype=torch.float64, generator=generator) - 0.5, dim=-1
+    )
+    ends = torch.rand(60, 2, 3, dtype=torch.float64, generator=generator) * 8 - 4
+    flat = (start.reshape(-1, 3), along.reshape(-1, 3))
+    none, zero = torch.zeros(120, dtype=torch.int64), torch.zeros_like(flat[0])
+    edges = Edges(
+        none, none, none, *flat, zero[:, 0] + 9.0, zero, zero, zero, zero[:, 0] + torch.inf
+    )
+    t, settled = diffraction._newton(
+        edges, torch.zeros(60, 2, dtype=torch.float64), ends[:, 0], ends[:, 1]
+    )
+    assert bool(settled.all())
+    for c in range(60):
+
+        def length(t, c=c):
+            x = start[c] + torch.tensor(t)[:, None] * along[c]
+            line = torch.cat([ends[c, :1], x, ends[c, 1:]])
+            return float((line[1:] - line[:-1]).norm(dim=-1).sum())
+
+        best = minimize(
+            length, [0.0, 0.0], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 0}
+        )
+        assert length(t[c].tolist()) <= best.fun + 1e-9
