@@ -172,12 +172,13 @@ class Pattern:
         writer = csv.writer(out, lineterminator="\n")
         writer.writerow(("theta_deg", "phi_deg", *(FIELD if self.vector else GAIN)))
         theta, phi = (torch.rad2deg(a).tolist() for a in (self.theta, self.phi))
-        rows = self.samples.detach().cpu()
-        for t, row in zip(theta, rows, strict=True):
-            for p, (first, second) in zip(phi[:-1], row[:-1].tolist(), strict=True):
-                field = (first.real, first.imag, second.real, second.imag)
-                values = field if self.vector else (_db(abs(first) ** 2),)
-                writer.writerow((repr(t), repr(p), *map(repr, values)))
+        samples = self.samples.detach().cpu()
+        values = torch.view_as_real(samples).flatten(2)
+        if not self.vector:
+            values = 20.0 * torch.log10(samples[..., :1].abs())
+        for t, row in zip(theta, values.tolist(), strict=True):
+            for p, cells in zip(phi[:-1], row[:-1], strict=True):
+                writer.writerow(map(repr, (t, p, *cells)))
         return out.getvalue().encode()
 
     def __str__(self) -> str:
@@ -308,9 +309,11 @@ def _read_csv(text: str, where: str) -> Grid:
             if len(table) >= MAX_SAMPLES:
                 faults.add(here, f"more than {MAX_SAMPLES} samples")
                 break
-            numbers = [
-                _number(row[k], c, here, faults) for k, c in zip(order, columns, strict=True)
-            ]
+            numbers = _numbers([row[k] for k in order])
+            if numbers is None:
+                for k, c in zip(order, columns, strict=True):
+                    _number(row[k], c, here, faults)
+                continue
             place = (numbers[0], numbers[1])
             if place in table:
                 faults.add(here, f"theta_deg {place[0]:g}, phi_deg {place[1]:g} stands twice")
@@ -328,6 +331,16 @@ def _read_csv(text: str, where: str) -> Grid:
     if values == GAIN:
         return theta, phi, 10.0 ** (samples[..., 0] / 20.0)
     return theta, phi, torch.view_as_complex(samples.reshape(len(theta), len(phi), 2, 2))
+
+
+def _numbers(cells: list[str]) -> list[float] | None:
+    """A line's numbers, or None where ``_number`` has a fault to tell."""
+    try:
+        numbers = [float(cell) for cell in cells]
+    except ValueError:
+        return None
+    null = len(numbers) == 3 and numbers[2] == -math.inf  # a gain of nothing
+    return numbers if all(map(math.isfinite, numbers[: 2 if null else None])) else None
 
 
 def _number(text: str, column: str, where: str, faults: _Faults) -> float:
