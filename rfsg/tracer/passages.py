@@ -12,7 +12,7 @@ from rfsg.tracer.embree import Proxies
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.march import EVALUATE, crossings
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.records import Crossings, Paths, Rays
+from rfsg.tracer.records import Crossings, Paths, Rays, Spans, runs_in
 
 OWN_RIPPLE = 0.25  # [wavelengths] along the normal: a path that leaves a learned face may graze it
 
@@ -81,12 +81,22 @@ def _found(
     return path[runs.ray], segment[runs.ray], runs, crossed
 
 
-def every_crossing(world: World, proxies: Proxies, rays: Rays, quality: Quality) -> Crossings:
-    """All crossings of rays, a chunk of rays at a time."""
+def every_crossing(
+    world: World,
+    proxies: Proxies,
+    rays: Rays,
+    quality: Quality,
+    only: Bool[Tensor, "n"] | None = None,
+) -> Crossings:
+    """All crossings of rays, a chunk of rays at a time; only: of these nodes."""
     parts = []
     for i in torch.arange(len(rays.limit), device=world.device).split(quality.chunk):
         some = Rays(rays.origin[i], rays.direction[i], rays.limit[i])
-        found = crossings(world, some, proxies.spans(some), EVALUATE)
+        spans = proxies.spans(some)
+        if only is not None:
+            kept = only[spans.which]
+            spans = Spans(*(getattr(spans, n)[kept] for n in Spans.__dataclass_fields__))
+        found = crossings(world, some, spans, EVALUATE)
         parts.append([i[found.ray], *(getattr(found, n) for n in _BUT_RAY)])
     if not parts:
         none, zero = rays.limit.new_zeros(0, dtype=torch.int64), rays.limit.new_zeros(0)
@@ -137,9 +147,9 @@ def _medium(
     world: World, paths: Paths, path: Tensor, segment: Tensor, inside: Crossings
 ) -> Bool[Tensor, "m"]:
     """Crossings of the medium that a refracted segment runs in."""
-    runs_in = paths.runs_in()[path, segment][inside.ray]
-    same = world.medium[runs_in.clamp(min=0)] == world.medium[inside.which]
-    return (runs_in >= 0) & same
+    solid = runs_in(paths.which, paths.act)[path, segment][inside.ray]
+    same = world.medium[solid.clamp(min=0)] == world.medium[inside.which]
+    return (solid >= 0) & same
 
 
 def _own(

@@ -49,6 +49,7 @@ class Status(IntEnum):
     UNRESOLVED = 7
     OPAQUE = 8
     DEGENERATE = 9
+    REFRACTED = 10
 
     @property
     def sentence(self) -> str:
@@ -66,6 +67,7 @@ _SENTENCES = {
     Status.UNRESOLVED: "the reflecting piece is too small or too rough at the wave's scale to act as a mirror",
     Status.OPAQUE: "an opaque object stands on the path",
     Status.DEGENERATE: "transmitter, receiver or vertices coincide: no direction is defined",
+    Status.REFRACTED: "a solid bends the wave off this straight line, or reflects it totally",
 }
 
 
@@ -134,25 +136,6 @@ class Paths:
     caustics: Int[Tensor, "p"]
     status: Int[Tensor, "p"]
 
-    def runs_in(self) -> Int[Tensor, "p s"]:
-        """The solid that each segment runs in, refracted; -1 in free space and along straight paths.
-
-        From an ENTER to the next LEAVE; before a first LEAVE, and after a last ENTER, a radio is inside.
-        """
-        depth, none = self.which.shape[1], torch.full_like(self.tx, -1)
-        after, before = [none], [none]
-        for k in range(depth):
-            after.append(self._past(k, Act.ENTER, Act.LEAVE, after[-1]))
-            before.append(self._past(depth - 1 - k, Act.LEAVE, Act.ENTER, before[-1]))
-        return torch.maximum(torch.stack(after, 1), torch.stack(before[::-1], 1))
-
-    def _past(self, level: int, enter: Act, leave: Act, inside: Tensor) -> Int[Tensor, "p"]:
-        """The solid on the other side of a vertex."""
-        act, which = self.act[:, level], self.which[:, level]
-        met = which >= 0
-        inside = torch.where(met & (act == leave), -1, inside)
-        return torch.where(met & (act == enter), which, inside)
-
     def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "p"]) -> "Paths":
         """Some of the paths."""
         return Paths(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
@@ -181,6 +164,25 @@ class Paths:
         return Paths(
             *(torch.cat([getattr(p, n) for p in parts]) for n in Paths.__dataclass_fields__)
         )
+
+
+def runs_in(which: Int[Tensor, "p d"], act: Int[Tensor, "p d"]) -> Int[Tensor, "p s"]:
+    """The solid that each segment runs in, refracted; -1 in free space and along straight paths.
+
+    From an ENTER to the next LEAVE; before a first LEAVE, and after a last ENTER, a radio is inside.
+    """
+    depth, none = which.shape[1], which.new_full((len(which),), -1)
+
+    def past(level: int, enter: Act, leave: Act, inside: Tensor) -> Tensor:
+        met = which[:, level] >= 0
+        inside = torch.where(met & (act[:, level] == leave), -1, inside)
+        return torch.where(met & (act[:, level] == enter), which[:, level], inside)
+
+    after, before = [none], [none]
+    for k in range(depth):
+        after.append(past(k, Act.ENTER, Act.LEAVE, after[-1]))
+        before.append(past(depth - 1 - k, Act.LEAVE, Act.ENTER, before[-1]))
+    return torch.maximum(torch.stack(after, 1), torch.stack(before[::-1], 1))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.scene.world import World, unit
@@ -176,7 +176,7 @@ def _stationary(world: World, batch: Batch, wavelength: float, quality: Quality)
     part, charts = batch.take(found), charts.take(found)
     facets = _last_measure(world, part, charts, wavelength, quality)
     surfaces = surfaces_of(world, part, facets)
-    vertices = part.polyline(_implicit_step(part, surfaces))
+    vertices = part.polyline(implicit_step(part, surfaces))
     jet = surfaces.jet(vertices[:, 1:-1])
     cap = torch.tensor(1.0 / wavelength, dtype=x.dtype, device=x.device)
     lam = multipliers(segments(vertices)[1], jet.gradient)
@@ -188,7 +188,7 @@ def _stationary(world: World, batch: Batch, wavelength: float, quality: Quality)
         good = outcome == int(Status.OK)
         outcome = torch.where(good & ~regular, int(Status.DEGENERATE), outcome)
         outcome = torch.where(good & regular & capped, int(Status.CAUSTIC_CAPPED), outcome)
-        status[found] = _duplicates(part, vertices, charts.radius, outcome)
+        status[found] = duplicates(part, vertices, charts.radius, outcome)
     return Solved(
         batch.polyline().index_copy(0, found, vertices),
         torch.zeros_like(batch.x).index_copy(0, found, normal),
@@ -242,14 +242,16 @@ def _last_measure(
     )
 
 
-def _implicit_step(batch: Batch, surfaces: Surfaces) -> Tensor:
-    """x - K^-1 residual, with K held fixed: the same point, now carrying gradients."""
+def implicit_step(
+    batch: Batch, surfaces: Surfaces, index: Float[Tensor, "c s"] | None = None
+) -> Float[Tensor, "c d 3"]:
+    """x - K^-1 residual, with K held fixed: the same points, now carrying gradients."""
     vertices = batch.polyline()
     jet = surfaces.jet(batch.x)
     with torch.no_grad():
-        lam = multipliers(segments(vertices)[1], jet.gradient)
-        matrix = kkt(vertices, jet, lam).matrix
-    residual = kkt(vertices, jet, lam).residual
+        lam = multipliers(segments(vertices)[1], jet.gradient, index)
+        matrix = kkt(vertices, jet, lam, index).matrix
+    residual = kkt(vertices, jet, lam, index).residual
     step, _ = solve_regular(matrix, residual[..., None])
     depth = batch.which.shape[1]
     return batch.x - step[:, : 3 * depth, 0].reshape(-1, depth, 3)
@@ -269,24 +271,12 @@ def _validate(
     with torch.no_grad():
         c, depth = batch.which.shape
         length, u = segments(vertices)
-        which, x = batch.which.reshape(-1), vertices[:, 1:-1].reshape(-1, 3)
         finite = torch.isfinite(vertices).all(-1).all(-1)
-        x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
         front = ((u[:, :-1] * normal).sum(-1) < -GRAZING) & ((u[:, 1:] * normal).sum(-1) > GRAZING)
-        f = world.sdf(which, x).abs().reshape(c, depth)
-        on = f <= tolerance(world, batch, wavelength)
-        exact = world.exact[which]
-        # a planar face is itself alone; a curved surface may be sought from another of its pieces
-        patch = world.patch(which, x)
-        planar = world.plane(which, batch.patch.reshape(-1))[2]
-        curved = ~planar & ~world.plane(which, patch)[2]
-        same = (patch == batch.patch.reshape(-1)) | curved
-        rim = torch.zeros_like(exact)
-        i = torch.nonzero(exact & curved).squeeze(-1)
-        rim[i] = _on_a_rim(world, which[i], x[i], normal.reshape(-1, 3)[i])
-        on = on & ((same & ~rim) | ~exact).reshape(c, depth)
-        status = torch.full((c,), int(Status.OK), device=x.device)
+        on = on_faces(world, batch, vertices, normal, wavelength)
+        status = torch.full((c,), int(Status.OK), device=vertices.device)
         if facets is not None:
+            exact = world.exact[batch.which.reshape(-1)]
             resolved = torch.ones_like(exact)
             resolved[~exact] = facets.resolved(wavelength)
             status[~resolved.reshape(c, depth).all(1)] = int(Status.UNRESOLVED)
@@ -294,6 +284,32 @@ def _validate(
         status[~on.all(1)] = int(Status.OFF_SURFACE)
         status[~(length > 0).all(1) | ~finite] = int(Status.DEGENERATE)
         return status
+
+
+@torch.no_grad()
+def on_faces(
+    world: World,
+    batch: Batch,
+    vertices: Float[Tensor, "c k 3"],
+    normal: Float[Tensor, "c d 3"],
+    wavelength: float,
+) -> Bool[Tensor, "c d"]:
+    """Which vertices lie on the face that they were sought on, within its bounds."""
+    c, depth = batch.which.shape
+    which, x = batch.which.reshape(-1), vertices[:, 1:-1].reshape(-1, 3)
+    x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
+    f = world.sdf(which, x).abs().reshape(c, depth)
+    exact = world.exact[which]
+    # a planar face is itself alone; a curved surface may be sought from another of its pieces
+    patch = world.patch(which, x)
+    planar = world.plane(which, batch.patch.reshape(-1))[2]
+    curved = ~planar & ~world.plane(which, patch)[2]
+    same = (patch == batch.patch.reshape(-1)) | curved
+    rim = torch.zeros_like(exact)
+    i = torch.nonzero(exact & curved).squeeze(-1)
+    rim[i] = _on_a_rim(world, which[i], x[i], normal.reshape(-1, 3)[i])
+    within = ((same & ~rim) | ~exact).reshape(c, depth)
+    return (f <= tolerance(world, batch, wavelength)) & within
 
 
 def _on_a_rim(world: World, which: Tensor, x: Tensor, normal: Tensor) -> Tensor:
@@ -311,7 +327,12 @@ def _on_a_rim(world: World, which: Tensor, x: Tensor, normal: Tensor) -> Tensor:
     return rim
 
 
-def _duplicates(batch: Batch, vertices: Tensor, radius: Tensor, status: Tensor) -> Tensor:
+def duplicates(
+    batch: Batch,
+    vertices: Float[Tensor, "c k 3"],
+    radius: Float[Tensor, "c d"],
+    status: Int[Tensor, "c"],
+) -> Int[Tensor, "c"]:
     """Solutions of one sequence of objects closer than a zone (or, on exact surfaces, closer than
     rounding) are one path: the shortest stays."""
     good = (status == int(Status.OK)) | (status == int(Status.CAUSTIC_CAPPED))
