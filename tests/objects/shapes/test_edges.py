@@ -1,13 +1,27 @@
 """Edges of known shapes, meshes and learned objects."""
 
 import math
+import runpy
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import trimesh
 from torch.autograd import gradcheck
 
+from rfsg.objects.shapes import edges as module
 from rfsg.objects.shapes.analytic import Box, Capsule, Cylinder, HalfSpace, Sphere
-from rfsg.objects.shapes.edges import Edges, box_edges, cylinder_edges, edges_of
+from rfsg.objects.shapes.edges import (
+    Edges,
+    box_edges,
+    cylinder_edges,
+    edges_of,
+    learned_edges,
+    mesh_edges,
+)
+from rfsg.objects.shapes.neural import NeuralShape
+from rfsg.scene.assets import load_asset
 
 F64 = torch.float64
 
@@ -83,3 +97,171 @@ def test_sizes_differentiate():
     assert gradcheck(box, (half,))
     sizes = [torch.tensor(x, dtype=F64, requires_grad=True) for x in (0.4, 0.6)]
     assert gradcheck(cylinder, sizes)
+
+
+# meshes
+
+
+def _matched(found: Edges, true: Edges) -> tuple[float, float, int]:
+    """Worst gap of end points [m], worst angle of normals [deg], and how many true ones were met.
+
+    Every found edge is compared with the true one whose ends are nearest, in either sense.
+    """
+    gap, angle, met = 0.0, 0.0, set()
+    ends = torch.stack([true.start, true.end])
+    for k in range(len(found)):
+        own = torch.stack([found.start[k], found.end[k]])[:, None]
+        distances = torch.stack([(own - e).norm(dim=-1).amax(0) for e in (ends, ends.flip(0))])
+        i = int(distances.amin(0).argmin())
+        gap, _ = max(gap, float(distances[:, i].min())), met.add(i)
+        normals = torch.stack([found.normal0[k], found.normal1[k]])
+        others = torch.stack([true.normal0[i], true.normal1[i]])
+        cosine = max(float((normals * o).sum(-1).amin()) for o in (others, others.flip(0)))
+        angle = max(angle, math.degrees(math.acos(min(1.0, cosine))))
+    return gap, angle, len(met)
+
+
+@pytest.mark.parametrize("pieces", ["whole", "divided", "every triangle for itself"])
+def test_a_box_as_a_mesh(pieces):
+    """However its faces are cut: 12 edges of full length, faces numbered alike."""
+    mesh = trimesh.creation.box(extents=[0.6, 1.0, 1.4])
+    if pieces == "divided":
+        mesh = mesh.subdivide().subdivide().subdivide()
+    vertices, faces = mesh.vertices, mesh.faces
+    if pieces == "every triangle for itself":
+        vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
+    edges = mesh_edges(np.array(vertices), np.array(faces))
+    assert len(edges) == 12
+    gap, angle, met = _matched(edges, box_edges(torch.tensor([0.3, 0.5, 0.7], dtype=F64)))
+    assert met == 12 and gap < 1e-12 and angle < 1e-5
+    assert len(torch.unique(torch.cat([edges.patch0, edges.patch1]))) == 6
+    for patch in torch.unique(edges.patch0):
+        normals = torch.cat(
+            [edges.normal0[edges.patch0 == patch], edges.normal1[edges.patch1 == patch]]
+        )
+        torch.testing.assert_close(normals, normals[:1].expand_as(normals))
+
+
+def _sources() -> dict:
+    path = Path(__file__).resolve().parents[3] / "assets" / "sources" / "make_meshes.py"
+    return runpy.run_path(str(path))["MAKERS"]
+
+
+def test_inner_edges_are_left_out():
+    """A cabinet on a plinth set back: 12 + 8 convex edges, and 4 concave ones that are not."""
+    mesh = _sources()["cabinet"]()
+    edges = mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
+    assert len(edges) == 20
+    torch.testing.assert_close(edges.opening, torch.full((20,), 1.5, dtype=F64))
+    lengths = (edges.end - edges.start).norm(dim=-1).sort().values
+    expected = [0.06] * 4 + [0.37] * 2 + [0.45] * 4 + [0.82] * 2 + [0.9] * 4 + [1.34] * 4
+    torch.testing.assert_close(lengths, torch.tensor(expected, dtype=F64), atol=1e-6, rtol=0)
+
+
+def test_the_rims_of_a_tessellated_cylinder():
+    """32 pieces each, at 90 degrees; the side turns by 11 degrees from facet to facet: no edges."""
+    mesh = trimesh.creation.cylinder(radius=0.4, height=1.0, sections=32)
+    edges = mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
+    assert len(edges) == 64
+    torch.testing.assert_close(edges.opening, torch.full((64,), 1.5, dtype=F64))
+    chord = 2 * 0.4 * math.sin(math.pi / 32)
+    torch.testing.assert_close(
+        (edges.end - edges.start).norm(dim=-1), torch.full((64,), chord, dtype=F64)
+    )
+    fine = trimesh.creation.cylinder(radius=0.4, height=1.0, sections=1000)
+    edges = mesh_edges(np.array(fine.vertices), np.array(fine.faces))
+    middle = 0.5 * (edges.start + edges.end)
+    out = middle * torch.tensor([1.0, 1.0, 0.0], dtype=F64)
+    out = out / out.norm(dim=-1, keepdim=True)
+    radial = torch.maximum((edges.normal0 * out).sum(-1), (edges.normal1 * out).sum(-1))
+    assert float(radial.min()) > math.cos(math.radians(1.0))
+
+
+def test_a_sheet_is_a_half_plane_all_round():
+    vertices = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+    edges = mesh_edges(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+    assert len(edges) == 4
+    torch.testing.assert_close(edges.opening, torch.full((4,), 2.0, dtype=F64))
+
+
+def test_smooth_and_empty_meshes_have_none():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    assert len(mesh_edges(np.array(ball.vertices), np.array(ball.faces))) == 0
+    assert len(mesh_edges(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))) == 0
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    assert len(mesh_edges(flat, np.array([[0, 1, 2]]))) == 0
+
+
+def test_what_is_no_mesh_is_refused(monkeypatch):
+    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
+    with pytest.raises(ValueError, match="0 to 2"):
+        mesh_edges(vertices, faces + 1)
+    with pytest.raises(ValueError, match="not finite"):
+        mesh_edges(vertices * np.nan, faces)
+    with pytest.raises(ValueError, match="angle_deg=0"):
+        mesh_edges(vertices, faces, 0.0)
+    monkeypatch.setattr(module, "MAX_TRIANGLES", 0)
+    with pytest.raises(ValueError, match="1 triangles"):
+        mesh_edges(vertices, faces)
+
+
+# learned shapes
+
+OBJECTS = Path(__file__).resolve().parents[3] / "assets" / "objects"
+
+
+def _learned(name: str) -> NeuralShape:
+    shape = load_asset(OBJECTS / name / f"{name}.usda").body.shape
+    assert isinstance(shape, NeuralShape)
+    return shape
+
+
+def _true(name: str) -> Edges:
+    mesh = _sources()[name]()
+    return mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+def test_the_edges_of_the_learned_cabinet():
+    """All 20 of the mesh it was learned from, the 12 of its body too: within 1 mm and half a degree."""
+    shape = _learned("cabinet")
+    edges = edges_of(shape)
+    assert len(edges) == 20 and not edges.start.requires_grad
+    gap, angle, met = _matched(edges, _true("cabinet"))
+    assert met == 20 and gap < 1e-3 and angle < 0.5
+    assert edges_of(shape) is edges  # kept
+    with torch.no_grad():
+        shape.to_value.bias.add_(0.01)  # f of 1 cm more: every face moves in
+    smaller = edges_of(shape)
+    assert float(smaller.start.abs().amax()) < float(edges.start.abs().amax()) - 5e-3
+
+
+def _off(point: torch.Tensor, edges: Edges) -> torch.Tensor:
+    """Distances of a point from edges [m]."""
+    along = edges.end - edges.start
+    t = ((point - edges.start) * along).sum(-1) / (along * along).sum(-1)
+    return (edges.start + t.clamp(0, 1)[:, None] * along - point).norm(dim=-1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["desk", "chair"])
+def test_the_edges_of_learned_furniture(name):
+    """Each lies on one of the mesh it was learned from, between the same faces; 9 tenths are found.
+
+    Missed: edges of a few centimetres, and the chair's posts where its back covers their faces.
+    """
+    found, true = edges_of(_learned(name)), _true(name)
+    cosine = math.cos(math.radians(1.0))
+    for k in range(len(found)):
+        off = torch.maximum(_off(found.start[k], true), _off(found.end[k], true))
+        normals = torch.stack([found.normal0[k], found.normal1[k]])
+        there = (normals[:, None] * torch.stack([true.normal0, true.normal1])).sum(-1).amin(0)
+        turned = (normals[:, None] * torch.stack([true.normal1, true.normal0])).sum(-1).amin(0)
+        assert bool(((off < 3e-3) & (torch.maximum(there, turned) > cosine)).any())
+    length = [(e.end - e.start).norm(dim=-1).sum() for e in (found, true)]
+    assert 0.9 * length[1] < length[0] < 1.001 * length[1]
+
+
+@pytest.mark.parametrize("shape", ["person", "sphere"])
+def test_round_learned_shapes_have_none(shape):
+    ball = NeuralShape([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]], lipschitz=2.0)
+    assert len(learned_edges(ball if shape == "sphere" else _learned("person"))) == 0
