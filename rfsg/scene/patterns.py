@@ -93,7 +93,9 @@ class Pattern:
         else:
             end = (samples[:, :1] + samples[:, -1:]) / 2
             samples = torch.cat([end, samples[:, 1:-1], end], 1)
-        theta, phi = (torch.from_numpy(np.deg2rad(a)) for a in (theta_deg, phi_deg))
+        theta, phi = (
+            torch.from_numpy(np.deg2rad(a)).to(samples.device) for a in (theta_deg, phi_deg)
+        )
         pole = _one_vector if vector else _one_power
         north, south = pole(samples[0], phi, 1.0), pole(samples[-1], phi, -1.0)
         samples = torch.cat([north[None], samples[1:-1], south[None]])
