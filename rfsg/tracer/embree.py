@@ -14,7 +14,7 @@ from embreex.mesh_construction import TriangleMesh
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rfsg.scene.world import World
+from rfsg.scene.world import FLUSH, World
 from rfsg.tracer.records import Rays, Spans
 
 # The twelve triangles of a box whose corner k has bits (x, y, z) of k.
@@ -143,10 +143,15 @@ def _product(n: int, nodes: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _slab(world: World, rays: Rays, ray: Tensor, which: Tensor) -> tuple[Tensor, Tensor]:
-    """Exact (enter, leave) of lines through nodes' boxes, in the object's frame, in metres."""
+    """Exact (enter, leave) of lines through nodes' boxes, in the object's frame, in metres.
+
+    The boxes are a hair wider than their objects: a ray in a face, or in the rounding between two
+    flush ones, has its span (see ``seams``).
+    """
     o = world.point_object(which, rays.origin[ray])
     d = world.direction_object(which, rays.direction[ray])
-    low, high = world.bounds_object[which, 0], world.bounds_object[which, 1]
+    skin = (0.5 * FLUSH / world.scale[which])[:, None]
+    low, high = world.bounds_object[which, 0] - skin, world.bounds_object[which, 1] + skin
     parallel = d == 0
     safe = torch.where(parallel, torch.ones_like(d), d)
     a, b = (low - o) / safe, (high - o) / safe

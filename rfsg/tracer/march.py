@@ -8,22 +8,19 @@ hits (12 % of them in a trial at the paper's 0.01 m). The root is then polished 
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Shape
 from rfsg.scene.world import World
 from rfsg.tracer.embree import sort_by
 from rfsg.tracer.records import Crossings, Rays, Spans
+from rfsg.tracer.seams import ASIDE, along_seams
 
 MOST_ROOTS = 16  # boundaries of one object on one ray; a chair's back has about ten
 
 TOUCH = 1e-8  # [m] an end this near a boundary lies on it, as a foot on a floor: neither in nor out
-FORWARD = (
-    1.0,
-    0.7548776662466927,
-    0.5698402909980532,
-)  # no direction of a drawing is at right angles to it
+FORWARD = ASIDE  # no direction of a drawing is at right angles to it
 
 
 @dataclass(frozen=True)
@@ -45,16 +42,17 @@ EVALUATE = MarchOptions(dtype=torch.float64, polish=40)
 def crossings(world: World, rays: Rays, spans: Spans, options: MarchOptions = SEARCH) -> Crossings:
     """The true stretches of rays inside objects, within their spans, with outward normals."""
     convex = world.convex[spans.which]
-    parts = [_convex(world, rays, _select(spans, convex))]
+    parts, aside = _convex(world, rays, _select(spans, convex))
     if not bool(convex.all()):
         rest = _select(spans, ~convex)
         for begin in range(0, len(rest.ray), options.chunk):
             piece = slice(begin, begin + options.chunk)
             parts.append(_learned(world, rays, _select(rest, piece), options))
     ray, which, enter, leave = (torch.cat(column) for column in zip(*parts, strict=True))
+    aside = torch.cat([aside, aside.new_zeros(len(ray) - len(aside), 3)])
     order = sort_by(ray, enter)
     ray, which, enter, leave = ray[order], which[order], enter[order], leave[order]
-    normals = _normals(world, rays, ray, which, torch.cat([enter, leave]))
+    normals = _normals(world, rays, ray, which, torch.cat([enter, leave]), aside[order])
     return Crossings(
         ray,
         which,
@@ -69,23 +67,55 @@ def _select(spans: Spans, i: Tensor | slice) -> Spans:
     return Spans(spans.ray[i], spans.which[i], spans.enter[i], spans.leave[i])
 
 
-def _normals(world: World, rays: Rays, ray: Tensor, which: Tensor, t: Tensor) -> Tensor:
+def _normals(
+    world: World, rays: Rays, ray: Tensor, which: Tensor, t: Tensor, aside: Tensor
+) -> Tensor:
     ray, which = ray.repeat(2), which.repeat(2)
     finite = torch.where(torch.isfinite(t), t, torch.zeros_like(t))  # a half-space may never end
-    return world.normal(which, rays.origin[ray] + finite[:, None] * rays.direction[ray])
+    point = rays.origin[ray] + finite[:, None] * rays.direction[ray] + aside.repeat(2, 1)
+    return world.normal(which, point)
 
 
 def _zero_where(condition: Tensor, normal: Tensor) -> Tensor:
     return torch.where(condition[:, None], torch.zeros_like(normal), normal)
 
 
-def _convex(world: World, rays: Rays, spans: Spans) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _convex(
+    world: World, rays: Rays, spans: Spans
+) -> tuple[list[tuple[Tensor, Tensor, Tensor, Tensor]], Tensor]:
+    """Stretches in convex nodes, then those along seams between them; and how far aside of the ray
+    their normals are asked for [m 3]."""
     ray, which = spans.ray, spans.which
     enter, leave = world.interval(which, rays.origin[ray], rays.direction[ray])
     enter = torch.clamp(enter, min=0.0)
     leave = torch.minimum(leave, rays.limit[ray])
     inside = leave > enter
-    return ray[inside], which[inside], enter[inside], leave[inside]
+    in_face = _in_face(world, rays, spans, inside, enter, leave)
+    inside &= ~in_face
+    parts = [(ray[inside], which[inside], enter[inside], leave[inside])]
+    aside = rays.origin.new_zeros(len(parts[0][0]), 3)
+    if int(in_face.sum()) > 1:
+        seam, off = along_seams(world, rays, _select(spans, in_face))
+        parts.append((seam.ray, seam.which, seam.enter, seam.leave))
+        aside = torch.cat([aside, off])
+    return parts, aside
+
+
+def _in_face(
+    world: World, rays: Rays, spans: Spans, inside: Tensor, enter: Tensor, leave: Tensor
+) -> Bool[Tensor, "m"]:
+    """Where a ray runs in a face, or no deeper below it than rounding: its stretch, or that of its
+    span where it has none, is long and never deep."""
+    enter = torch.where(inside, enter, spans.enter)
+    leave = torch.where(inside, leave, spans.leave)
+    long = world.flat[spans.which] & (leave - enter > TOUCH)
+    i = torch.nonzero(long).squeeze(-1)
+    middle = 0.5 * (enter + torch.where(torch.isfinite(leave), leave, enter))[i]
+    ray = spans.ray[i]
+    point = rays.origin[ray] + middle[:, None] * rays.direction[ray]
+    in_face = torch.zeros_like(long)
+    in_face[i] = world.sdf(spans.which[i], point) > -0.25 * TOUCH
+    return in_face
 
 
 def _learned(

@@ -199,9 +199,11 @@ def _placed(world: World, paths: Paths, path: Tensor, segment: Tensor, runs: Run
         for k, (which, end) in enumerate(((runs.which, origin), (runs.last, target))):
             on_boundary = normals[k].abs().sum(-1, keepdim=True) > 0
             point = torch.where(on_boundary, _slid(world, which, points[k], direction), end)
-            turning = world.value_and_gradient(which, point)[1]
-            turns = on_boundary & world.exact[which, None]
-            points[k], normals[k] = point, torch.where(turns, unit(turning), normals[k])
+            turning = unit(world.value_and_gradient(which, point)[1])
+            # on an edge the slope may be that of the other face
+            alike = (turning * normals[k]).sum(-1, keepdim=True) > 0.5
+            turns = on_boundary & alike & world.exact[which, None]
+            points[k], normals[k] = point, torch.where(turns, turning, normals[k])
     return Crossing(*points, *normals)
 
 
