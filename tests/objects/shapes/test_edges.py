@@ -17,8 +17,8 @@ from rfsg.objects.shapes.edges import (
     box_edges,
     cylinder_edges,
     edges_of,
-    learned_edges,
     mesh_edges,
+    no_edges,
 )
 from rfsg.objects.shapes.neural import NeuralShape
 from rfsg.scene.assets import load_asset
@@ -221,18 +221,19 @@ def _true(name: str) -> Edges:
     return mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
 
 
-def test_the_edges_of_the_learned_cabinet():
+def test_the_edges_of_the_learned_cabinet(monkeypatch):
     """All 20 of the mesh it was learned from, the 12 of its body too: within 1 mm and half a degree."""
     shape = _learned("cabinet")
     edges = edges_of(shape)
     assert len(edges) == 20 and not edges.start.requires_grad
     gap, angle, met = _matched(edges, _true("cabinet"))
     assert met == 20 and gap < 1e-3 and angle < 0.5
+    others = no_edges()
+    monkeypatch.setattr(module, "_find", lambda *_: others)
     assert edges_of(shape) is edges  # kept
     with torch.no_grad():
-        shape.to_value.bias.add_(0.01)  # f of 1 cm more: every face moves in
-    smaller = edges_of(shape)
-    assert float(smaller.start.abs().amax()) < float(edges.start.abs().amax()) - 5e-3
+        shape.to_value.bias.add_(0.01)
+    assert edges_of(shape) is others  # until the network changes
 
 
 def _off(point: torch.Tensor, edges: Edges) -> torch.Tensor:
@@ -261,7 +262,5 @@ def test_the_edges_of_learned_furniture(name):
     assert 0.9 * length[1] < length[0] < 1.001 * length[1]
 
 
-@pytest.mark.parametrize("shape", ["person", "sphere"])
-def test_round_learned_shapes_have_none(shape):
-    ball = NeuralShape([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]], lipschitz=2.0)
-    assert len(learned_edges(ball if shape == "sphere" else _learned("person"))) == 0
+def test_a_round_learned_shape_has_none():
+    assert len(edges_of(_learned("person"))) == 0
