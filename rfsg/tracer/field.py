@@ -26,6 +26,7 @@ from rfsg.tracer.mechanisms import COEFFICIENT, DYAD
 from rfsg.tracer.passages import Passages, passages
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Channel, Paths
+from rfsg.tracer.refract import indices, inside
 
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
 
@@ -49,14 +50,15 @@ def channel(
     _, u = segments(paths.vertices)
     departure, arrival = u[:, 0], -_last(u, paths)
     scale = wavelength[None] / (4 * torch.pi) * paths.spread[:, None]
-    excess = _excess(world, paths, through, frequency)
+    way, refracted = inside(world, paths, frequency)
+    excess = _excess(world, paths, through, frequency) + refracted
     # T carries the phase of what was crossed; what moves into the delay leaves the gain. Every
     # caustic passed advances the phase by pi/2 (exp(+j 2 pi f t); Kouyoumjian and Pathak 1974, Eq. 6)
     phase = (
         2.0 * torch.pi * frequency[None] * excess[:, None]
         + 0.5 * torch.pi * paths.caustics[:, None]
     )
-    scale = scale * torch.polar(torch.ones_like(phase), phase)
+    scale = scale * way * torch.polar(torch.ones_like(phase), phase)
     at = Acting(world, paths, u, frequency, edges)
     jones = None
     if _polarised(transmitters, receivers):
@@ -75,7 +77,7 @@ def channel(
         frequency,
         paths.length / SPEED_OF_LIGHT + excess,
         gain,
-        _doppler(world, paths, u, transmitters, receivers, frequency[0]),
+        _doppler(world, paths, u, transmitters, receivers, frequency),
         departure,
         arrival,
         through.crossed,
@@ -237,7 +239,11 @@ def _doppler(
     receivers: tuple[Radio, ...],
     frequency: Tensor,
 ) -> Float[Tensor, "p"]:
-    """-(f / c) dL/dt, with dL/dt = u_last . v_rx - u_0 . v_tx + sum (u_i - u_{i+1}) . v_i [Hz]."""
+    """-(f / c) dL/dt, with dL/dt = u_last . v_rx - u_0 . v_tx + sum (u_i - u_{i+1}) . v_i [Hz].
+
+    Each u times the index that its segment runs in: L is the optical length.
+    """
+    u = u * indices(world, paths, frequency[:1])[..., None]
     zero = torch.zeros(0, 3, dtype=torch.float64, device=world.device)
     v_tx = torch.stack([r.velocity.to(zero) for r in transmitters]) if transmitters else zero
     v_rx = torch.stack([r.velocity.to(zero) for r in receivers]) if receivers else zero
@@ -246,4 +252,4 @@ def _doppler(
         i = torch.nonzero(paths.which[:, level] >= 0).squeeze(-1)
         moving = world.velocity[paths.which[i, level]]
         growth = growth.index_add(0, i, ((u[i, level] - u[i, level + 1]) * moving).sum(-1))
-    return -growth * frequency / SPEED_OF_LIGHT
+    return -growth * frequency[0] / SPEED_OF_LIGHT

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from rfsg.tracer import acting, diffraction, scatter
+from rfsg.tracer import acting, diffraction, refract, scatter
 from rfsg.tracer.acting import Acting
 from rfsg.tracer.records import Act
 
@@ -14,9 +14,13 @@ COEFFICIENT: dict[Act, Rule] = {
     Act.REFLECT: acting.reflection,
     Act.DIFFRACT: diffraction.coefficient,
     Act.SCATTER: scatter.coefficient,
+    Act.ENTER: refract.coefficient,
+    Act.LEAVE: refract.coefficient,
 }
 DYAD: dict[Act, Rule] = {
     Act.REFLECT: acting.reflection_dyad,
     Act.DIFFRACT: diffraction.dyad,
     Act.SCATTER: scatter.dyad,
+    Act.ENTER: refract.dyad,
+    Act.LEAVE: refract.dyad,
 }

@@ -130,6 +130,12 @@ def make_plan(world: World, quality: Quality) -> Plan:
         modelled.append("Doppler of moving radios and objects")
     else:
         left_out.append("Doppler: nothing moves")
+    if not bool(world.solid.any()):
+        left_out.append("refraction: the scene holds no solid")
+    elif not quality.refraction:
+        left_out.append("refraction: not asked for (refraction=False); solids are crossed straight")
+    else:
+        modelled.append("refraction in solids, at faces that are not parallel planes")
     if not quality.diffraction:
         left_out.append("edge diffraction: not asked for (diffraction=0)")
     rough = any(n.body.scattering is not None for n in scene.nodes)

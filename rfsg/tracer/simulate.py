@@ -14,7 +14,7 @@ from torch import Tensor
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
-from rfsg.tracer import diffraction, scatter, validity
+from rfsg.tracer import diffraction, refract, scatter, validity
 from rfsg.tracer import field as fields
 from rfsg.tracer.channel import Link, links, transfer
 from rfsg.tracer.edges import edges_in
@@ -94,6 +94,9 @@ def simulate(
             wavelength = SPEED_OF_LIGHT / float(frequencies[0])
             paths, counts = solve(world, chains, tx, rx, wavelength, quality)
             edges, more = None, []
+            if quality.refraction and bool(world.solid.any()):
+                bent = refract.bend(world, proxies, paths, frequencies, quality)
+                (paths,), more = bent.paths, [replace(bent, paths=())]
             if quality.diffraction:
                 edges = edges_in(world, wavelength)
                 more.append(diffraction.paths_of(world, edges, tx, rx, wavelength, quality))
