@@ -10,6 +10,10 @@ paper's literal rule: at each boundary one of the two is drawn and the weight di
 probability. At f = 0 Eqs. 13 and 14 give sigma_in = sigma_out, so for a learned surface the paper's
 p ~ sigma is a fair coin; known materials are drawn by |R|^2 : |T|^2.
 
+Where diffuse reflection is followed, a rough surface sends on a second ray in a direction drawn from
+its lobe, with the diffuse share of the power (``draw``: one of the two, by their powers). A ray scatters
+once, like a path of the solver; so at a depth of 2 the two hold the same orders.
+
 The lattice is shot in several turned copies; their scatter is the reported standard error.
 """
 
@@ -22,6 +26,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Contact
+from rfsg.objects.physics.lobes import mirrored
 from rfsg.scene.radios import Radio, amplitude
 from rfsg.scene.scene import Scene
 from rfsg.scene.world import World
@@ -38,6 +43,7 @@ from rfsg.tracer.launch import (
 from rfsg.tracer.march import crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Crossings, Rays
+from rfsg.tracer.scatter import rough_nodes
 from rfsg.tracer.simulate import positions, resolve_frequency, world_for
 
 COPIES = 8  # turned copies of the lattice; eight give the standard error to about a quarter
@@ -97,14 +103,15 @@ def flights(
             torch.full((per_copy,), torch.inf, dtype=torch.float64, device=world.device),
         )
         weight = pattern**2 / per_copy
+        fresh = torch.full_like(weight, quality.diffuse > 0, dtype=torch.bool)
         for level in range(quality.depth + 1):
             flight, reflected = _fly(
-                world, proxies, rays, weight, frequency, quality, branching, generator
+                world, proxies, rays, weight, fresh, frequency, quality, branching, generator
             )
             yield copy, flight
             if level == quality.depth or reflected is None:
                 break
-            rays, weight = reflected
+            rays, weight, fresh = reflected
 
 
 def _turn(generator: torch.Generator) -> Tensor:
@@ -118,22 +125,28 @@ def _fly(
     proxies: Proxies,
     rays: Rays,
     weight: Tensor,
+    fresh: Tensor,
     frequency: Tensor,
     quality: Quality,
     branching: str,
     generator: torch.Generator,
-) -> tuple[Flight, tuple[Rays, Tensor] | None]:
+) -> tuple[Flight, tuple[Rays, Tensor, Tensor] | None]:
+    """One level of rays, and those that they send on. fresh: rays that have not scattered yet."""
     inside = crossings(world, rays, proxies.spans(rays), search_options(quality))
     m = len(inside.ray)
     every = torch.arange(m, device=world.device)
     t = scalar(transmission_of(world, rays, inside, every, frequency))[:, 0].abs() ** 2
     r, point, outgoing, front = _reflections(world, rays, inside, frequency)
+    aside = _scattered(world, rays, inside, front & fresh[inside.ray], frequency, generator)
     if branching == "draw":
-        share = torch.where(world.learned_surface[inside.which], 0.5, r / (r + t).clamp(min=1e-300))
+        whole = r + aside.power
+        share = torch.where(
+            world.learned_surface[inside.which], 0.5, whole / (whole + t).clamp(min=1e-300)
+        )
         share = torch.where(front, share, torch.zeros_like(share))
         drawn = torch.rand(m, dtype=torch.float64, generator=generator).to(share) < share
         toll = -torch.log((t / (1 - share).clamp(min=1e-300)).clamp(min=1e-300))
-        gain = r / share.clamp(min=1e-300)
+        gain = whole / share.clamp(min=1e-300)
     else:
         drawn, toll, gain = front, -torch.log(t.clamp(min=1e-300)), r
     toll = torch.where(t <= 0, torch.inf, toll)
@@ -145,13 +158,68 @@ def _fly(
         turned = torch.where(drawn, inside.enter, torch.inf)
         end = end.scatter_reduce(0, inside.ray, turned, "amin")
         drawn = drawn & (inside.enter <= end[inside.ray])
+        kinds = _either(r, outgoing, aside, gain, generator)
+    else:
+        still = torch.zeros_like(drawn)
+        kinds = [(outgoing, gain, ~still), (aside.direction, aside.power * aside.weight, still)]
     flight = Flight(rays, weight, end, inside, toll)
     floor = weight.max() * 10.0 ** (quality.floor_db / 10.0) if len(weight) else 0.0
-    i = torch.nonzero(drawn & (arriving * gain > floor)).squeeze(-1)
-    if not len(i):
+    parts = []
+    for direction, power, straight in kinds:
+        i = torch.nonzero(drawn & (arriving * power > floor)).squeeze(-1)
+        kept = fresh[inside.ray[i]] & straight[i]
+        parts.append((point[i], direction[i], (arriving * power)[i], kept))
+    origin, direction, sent, kept = (torch.cat(c) for c in zip(*parts, strict=True))
+    if not len(sent):
         return flight, None
-    limit = torch.full((len(i),), torch.inf, dtype=torch.float64, device=world.device)
-    return flight, (Rays(point[i], outgoing[i], limit), (arriving * gain)[i])
+    return flight, (Rays(origin, direction, torch.full_like(sent, torch.inf)), sent, kept)
+
+
+@dataclass(frozen=True)
+class _Aside:
+    """What scatters at each crossing: its power, and a direction drawn with the weight p / q."""
+
+    power: Float[Tensor, "m"]
+    direction: Float[Tensor, "m 3"]
+    weight: Float[Tensor, "m"]
+
+
+def _scattered(
+    world: World,
+    rays: Rays,
+    inside: Crossings,
+    may: Tensor,
+    frequency: Tensor,
+    generator: torch.Generator,
+) -> _Aside:
+    """Nothing where the surface is smooth, or a ray may not scatter."""
+    d, normal = rays.direction[inside.ray], inside.normal_enter
+    power, weight = torch.zeros_like(inside.enter), torch.ones_like(inside.enter)
+    direction = d.clone()
+    i = torch.nonzero(may & rough_nodes(world)[inside.which]).squeeze(-1)
+    if not len(i):
+        return _Aside(power, direction, weight)
+    which, point = inside.which[i], rays.origin[inside.ray[i]] + inside.enter[i, None] * d[i]
+    contact = Contact(point, d[i], mirrored(d[i], normal[i]), normal[i])
+    power[i] = scalar(world.diffuse(which, contact, frequency))[:, 0].abs() ** 2
+    uniform = torch.rand(len(i), 4, dtype=torch.float64, generator=generator).to(d)
+    for body, j in world.surface_groups(which):
+        assert body.scattering is not None
+        k = i[j]
+        direction[k], weight[k] = body.scattering.draw(d[k], normal[k], uniform[j])
+    return _Aside(power, direction, weight)
+
+
+def _either(
+    r: Tensor, outgoing: Tensor, aside: _Aside, gain: Tensor, generator: torch.Generator
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Of mirror and diffuse ray one, drawn by their powers: (direction, power, whether mirrored)."""
+    if not bool(aside.power.any()):
+        return [(outgoing, gain, torch.ones_like(r, dtype=torch.bool))]
+    chance = aside.power / (r + aside.power).clamp(min=1e-300)
+    off = torch.rand(len(r), dtype=torch.float64, generator=generator).to(r) < chance
+    direction = torch.where(off[:, None], aside.direction, outgoing)
+    return [(direction, torch.where(off, gain * aside.weight, gain), ~off)]
 
 
 def _reflections(
