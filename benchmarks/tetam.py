@@ -341,6 +341,7 @@ def main() -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder of the tetam-ble data set")
     parser.add_argument("--quality", default="standard", help="draft, standard or reference")
     parser.add_argument("--depth", type=int, help="most reflections on a path")
+    parser.add_argument("--diffraction", type=int, help="most edges that a path bends round")
     parser.add_argument("--rays", type=int, help="directions launched from each sensor")
     parser.add_argument("--chunk", type=int, default=1024, help="places at a time")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "tetam")
@@ -362,7 +363,8 @@ def main() -> None:
     said = f"Log-distance exponent fitted on {TRAIN}: {exponent:.2f}."
     sight = None
     if not options.baseline_only:
-        overrides = {k: v for k in ("depth", "rays") if (v := getattr(options, k)) is not None}
+        names = ("depth", "diffraction", "rays")
+        overrides = {k: v for k in names if (v := getattr(options, k)) is not None}
         traced = trace(links, options.quality, overrides, options.chunk)
         at = (links.sensor, links.place)
         rays = {"power sum": traced.power_sum[at], "coherent sum": traced.coherent_sum[at]}
