@@ -53,8 +53,10 @@ are the limit phi_in -> 0 where both rays count, as they do for a radio just abo
 that arrives along a face *from another edge of it* is already their sum: ``along_face`` has the
 factor 1/2.
 
-**Validity.** k L >> 1 (better than a few per cent from l sin^2 beta0 of half a wavelength); other
-edges and the receiver further away than that; exact for the half plane and plane waves (n = 2).
+**Validity.** Exact for a conducting half plane and plane waves (n = 2). On conducting wedges lit by a
+line source the worst error about the edge is 1 % of the free field at L of half a wavelength, 3 % at
+0.2 and 8 % at 0.05, and falls as 1 / (k L) (eigenfunction series, tests). The edge must be long, and
+other edges far, against those lengths; R of lossy faces is a heuristic away from its boundaries.
 """
 
 import math
@@ -200,8 +202,10 @@ def along_face(
     field over a conductor goes by the slopes alone. Symmetric: reciprocal.
 
     The incident wave of edge 2 has its caustic at edge 1 across the edges: s_in of edge 2 is
-    ``distance``, and s_out of edge 1 too. Not valid where all of source, face and receiver lie in one
-    plane and transition zones overlap (Andersen 1997 for the limits; measured in the tests).
+    ``distance``, and s_out of edge 1 too. R is held in the slopes: right for conductors, for other
+    faces as heuristic as R at an edge is. Against a boundary integral, on a conducting screen of 2.3
+    wavelengths, within 0.6 % (soft) and 2 % (hard) of the free field, less at higher frequency; but 2 to
+    3 dB low where source, face and receiver lie in one plane, for transition zones then overlap.
     """
     b1, b2 = torch.sin(beta_first), torch.sin(beta_second)
     reach = (k * distance * b1 * b2)[..., None]
