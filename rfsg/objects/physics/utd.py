@@ -11,8 +11,8 @@ edge, equal for both rays (Keller's cone). Time exp(+j w t).
 
 **Four terms.** With delta the angle from a shadow boundary, positive on its lit side,
 
-    1  delta = pi + (phi_out - phi_in)            direct ray, shadowed by face 0
-    2  delta = pi - (phi_out - phi_in)            direct ray, shadowed by face n
+    1  delta = pi + (phi_out - phi_in)            direct ray, shadow next to face 0
+    2  delta = pi - (phi_out - phi_in)            direct ray, shadow next to face n
     3  delta = pi - (phi_out + phi_in)            reflection on face 0
     4  delta = pi + (phi_out + phi_in) - 2 pi n   reflection on face n
 
