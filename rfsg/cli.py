@@ -5,11 +5,9 @@ Heavy imports live inside the commands, so that ``rfsg --help`` answers at once.
 4 the numbers gave out (singular, out of memory), 130 interrupted.
 """
 
-import re
+import math
 import sys
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,15 +15,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rfsg import __version__
+from rfsg.parse import (
+    parse_duration,
+    parse_frequencies,
+    parse_frequency,
+    parse_move,
+    parse_numbers,
+    parse_pair,
+    parse_plane,
+    parse_quality,
+    parse_variants,
+)
+from rfsg.terminal import bar, note, print_files, print_table, say, short
 
 if TYPE_CHECKING:
     from rfsg.scene.scene import Scene
-    from rfsg.tracer.plan import Quality
 
 INTERNAL, USAGE, INPUT, NUMERIC, INTERRUPTED = 1, 2, 3, 4, 130
-UNITS = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9, "thz": 1e12}
 _NUMERIC_FAULTS = ("LinAlgError", "OutOfMemoryError")  # torch's, by name: torch may not be loaded
-HIGHEST_CREDIBLE_HZ = 1e15  # above this a unit was surely mistaken (ultraviolet light)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -41,6 +48,13 @@ app = typer.Typer(
 class Method(StrEnum):
     rays = "rays"
     paths = "paths"
+
+
+class Metric(StrEnum):
+    rss = "rss"
+    path_loss = "path-loss"
+    sinr = "sinr"
+    best_server = "best-server"
 
 
 class Axis(StrEnum):
@@ -60,54 +74,11 @@ def run(arguments: list[str]) -> int:
         code = app([a for a in arguments if a != "--debug"], "rfsg", standalone_mode=False)
         return code if isinstance(code, int) else 0
     except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+        return say("interrupted", INTERRUPTED)
     except Exception as error:
         if debug:
             traceback.print_exc()
-        return _say(*_verdict(error))
-
-
-def parse_frequency(text: str) -> float:
-    """'2.44GHz', '868 MHz' or '2.44e9' in hertz. Raises typer.BadParameter."""
-    match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([kmgt]?hz)?\s*", text, re.IGNORECASE)
-    try:
-        value = float(match[1]) * UNITS[(match[2] or "hz").lower()] if match else 0.0
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < HIGHEST_CREDIBLE_HZ:
-        raise typer.BadParameter(f"{text!r} is not a frequency; write for example 2.44GHz")
-    return value
-
-
-def parse_pair(text: str, what: str) -> tuple[str, str]:
-    """'A=B' as (A, B). Raises typer.BadParameter."""
-    left, equals, right = (part.strip() for part in text.partition("="))
-    if not (left and equals and right):
-        raise typer.BadParameter(f"{text!r}: expected {what}")
-    return left, right
-
-
-def parse_move(text: str) -> tuple[str, tuple[float, float, float]]:
-    """'/World/Cabinet=1.2,0,0' as path and metres. Raises typer.BadParameter."""
-    path, numbers = parse_pair(text, "PATH=x,y,z in metres, as in /World/Cabinet=1.2,0,0")
-    try:
-        x, y, z = (float(number) for number in numbers.split(","))
-    except ValueError:
-        raise typer.BadParameter(f"{text!r}: expected three numbers in metres after =") from None
-    return path, (x, y, z)
-
-
-def parse_quality(name: str, changes: list[str]) -> "Quality":
-    """A preset with single fields changed ('depth=2'). Raises typer.BadParameter."""
-    from rfsg.tracer.plan import Quality
-
-    pairs = dict(parse_pair(change, "FIELD=VALUE, as in depth=2") for change in changes)
-    try:
-        kinds = {key: type(value) for key, value in vars(Quality.named(name)).items()}
-        values = {key: kinds.get(key, str)(value) for key, value in pairs.items()}
-        return Quality.named(name, **values)
-    except ValueError as error:
-        raise typer.BadParameter(str(error)) from None
+        return say(*_verdict(error))
 
 
 SceneFile = Annotated[Path, typer.Argument(help="A USD scene (.usda, .usdc, .usdz).")]
@@ -120,6 +91,30 @@ Frequency = Annotated[
         metavar="NUMBER[Hz|kHz|MHz|GHz]",
         help="Carrier frequency. Default: the scene's own.",
     ),
+]
+Frequencies = Annotated[
+    list[str],
+    typer.Option(
+        "--frequency",
+        metavar="NUMBER[Hz|kHz|MHz|GHz][,...]",
+        help="Carrier frequencies, over one geometry: 2.4GHz,5GHz. Default: the scene's own.",
+    ),
+]
+Roots = Annotated[
+    list[Path],
+    typer.Option("--asset-root", metavar="FOLDER", help="Another folder the scene may read from."),
+]
+Variants = Annotated[
+    list[str],
+    typer.Option(
+        "--variant",
+        metavar="PRIM:SET=NAME",
+        help="Choose a variant for this run: /World/Door:state=open.",
+    ),
+]
+Time = Annotated[
+    float | None,
+    typer.Option(metavar="CODE", help="USD time code to read at. Default: the stage's start."),
 ]
 Preset = Annotated[str, typer.Option("--quality", help="draft, standard or reference.")]
 Changes = Annotated[
@@ -158,17 +153,43 @@ Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that
 def simulate(
     scene: SceneFile,
     out: Out,
-    frequency: Frequency = None,
+    frequency: Frequencies = [],
     quality: Preset = "standard",
     changes: Changes = [],
     move: Moves = [],
     replace: Replacements = [],
     without: Removals = [],
     receivers: Receivers = None,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_frequency,
+            metavar="NUMBER[Hz|kHz|MHz|GHz]",
+            help="Also write the frequency response and the taps over this band.",
+        ),
+    ] = None,
+    subcarriers: Annotated[
+        int | None, typer.Option(min=1, help="Sub-carriers in the band. Default: 64.")
+    ] = None,
+    snapshots: Annotated[
+        int | None,
+        typer.Option(min=1, help="Also write the channel at so many times: Doppler turns it."),
+    ] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_duration,
+            metavar="NUMBER[s|ms|us]",
+            help="The time that the snapshots are spread over.",
+        ),
+    ] = None,
     link: Annotated[
         list[str],
         typer.Option(metavar="TX=RX", help="Draw this link's delay profile (repeatable)."),
     ] = [],
+    asset_root: Roots = [],
+    variant: Variants = [],
+    time: Time = None,
     device: Device = "cpu",
     seed: Seed = 0,
     overwrite: Overwrite = False,
@@ -181,102 +202,174 @@ def simulate(
     """
     from rfsg import report
 
-    question = parse_quality(quality, changes)
+    if subcarriers is not None and bandwidth is None:
+        raise typer.BadParameter("--subcarriers divides a band: give --bandwidth as well")
+    if (snapshots is None) != (duration is None):
+        raise typer.BadParameter("--snapshots and --duration: give both or neither")
+    question, carriers = parse_quality(quality, changes), parse_frequencies(frequency)
     report.refuse_taken(out, overwrite)
-    edited = _edited(_read(scene), move, replace, without, receivers)
+    read = _read(scene, asset_root, variant, time)
+    edited = _edited(read, move, replace, without, receivers)
     _seed(seed)
+    import torch
+
     from rfsg.tracer import simulate as tracer
 
-    with _bar() as progress:
-        result = tracer.simulate(
-            edited, frequency, question, device=_device(device), progress=progress
+    hertz = torch.tensor(carriers, dtype=torch.float64) if carriers else None
+    with bar() as progress:
+        result = tracer.simulate(edited, hertz, question, device=_device(device), progress=progress)
+        progress("responses")
+        band = {} if subcarriers is None else {"subcarriers": subcarriers}
+        responses = report.response_arrays(
+            result, bandwidth, snapshots=snapshots, duration_s=duration, **band
         )
     asked = {"scene": str(scene), "move": move, "replace": replace, "without": without}
+    asked |= {"asset_roots": asset_root, "variants": variant, "time_code": time}
     asked |= {"seed": seed, "device": device, "receivers_file": receivers and str(receivers)}
+    asked |= {"bandwidth_hz": bandwidth, "snapshots": snapshots, "duration_s": duration, **band}
     chosen = _chosen_links(edited, result, link)
     with report.output_folder(out, overwrite) as folder:
         report.write_links(result, folder / "links.csv")
         report.write_paths(result, folder / "paths.csv")
-        report.write_channel(result, folder / "channel.npz")
+        report.write_channel(result, folder / "channel.npz", responses)
         report.write_json(report.report(result, **asked), folder / "report.json")
         _draw_run(edited, result, chosen, folder, title=scene.name)
     _print_links(result)
     for warning in result.warnings:
-        _note(warning)
-    _print_files(out, ("links.csv", "paths.csv", "channel.npz", "report.json"))
-    _print_files(out, ("scene.png", "pdp.png"))
+        note(warning)
+    print_files(out, ("links.csv", "paths.csv", "channel.npz", "report.json"))
+    print_files(out, ("scene.png", "pdp.png"))
 
 
 @app.command(name="map")
 def map_(
     scene: SceneFile,
     out: Out,
-    height: Annotated[float, typer.Option(help="Height of the plane [m].")] = 1.2,
-    cell: Annotated[float, typer.Option(help="Size of a cell [m].", min=1e-3)] = 0.5,
+    height: Annotated[
+        float | None, typer.Option(help="Height of a level plane [m]. Default: 1.2.")
+    ] = None,
+    plane: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ORIGIN:U:V",
+            help="Another plane: a point of it and its x and y directions, "
+            "0,2,0:1,0,0:0,0,1 for an upright one.",
+        ),
+    ] = None,
+    bounds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X0,Y0,X1,Y1", help="Corners in the plane [m]. Default: the scene's extent."
+        ),
+    ] = None,
+    on: Annotated[
+        str | None,
+        typer.Option(metavar="PRIM", help="Map the outside of this object instead of a plane."),
+    ] = None,
+    offset: Annotated[
+        float, typer.Option(min=0.0, help="With --on: how far before the surface [m].")
+    ] = 0.01,
+    cell: Annotated[
+        float | None,
+        typer.Option(
+            help="Size of a cell [m]. Default: 0.5 on a plane, 0.25 on an object.", min=1e-3
+        ),
+    ] = None,
+    metric: Annotated[
+        Metric, typer.Option(help="What map.png shows; map.npz holds all.")
+    ] = Metric.rss,
     transmitter: Annotated[
         str | None,
-        typer.Option(metavar="PATH", help="Draw this one. Default: the strongest in each cell."),
+        typer.Option(metavar="PATH", help="Draw this one. Default: the best in each cell."),
     ] = None,
+    bandwidth: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_frequency,
+            metavar="NUMBER[Hz|kHz|MHz|GHz]",
+            help="Band that the noise of the SINR fills. Default: 20MHz.",
+        ),
+    ] = None,
+    noise_figure: Annotated[float, typer.Option(help="Of the receivers [dB].")] = 0.0,
     method: Annotated[
-        Method, typer.Option(help="rays: mean over each cell, fast. paths: exact at its centre.")
-    ] = Method.rays,
+        Method | None,
+        typer.Option(
+            help="rays: mean over each cell, fast. paths: exact at its middle, with every "
+            "mechanism. Default: rays on a plane, paths on an object."
+        ),
+    ] = None,
     frequency: Frequency = None,
     quality: Preset = "standard",
     changes: Changes = [],
     move: Moves = [],
     replace: Replacements = [],
     without: Removals = [],
+    asset_root: Roots = [],
+    variant: Variants = [],
+    time: Time = None,
     device: Device = "cpu",
     seed: Seed = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Received power over a level plane, as a picture and as numbers.
+    """Received power, path loss, SINR and best server over a plane or over an object.
 
     Writes map.png, map.npz and report.json into --out.
 
-    Example: rfsg map lab.usda --height 1.2 --cell 0.25 --out map
+    Example: rfsg map lab.usda --height 1.2 --cell 0.25 --metric sinr --noise-figure 7 --out map
     """
     from rfsg import report
 
+    chosen = {"--height": height, "--plane": plane, "--on": on}
+    given = [name for name, value in chosen.items() if value is not None]
+    if len(given) > 1 or (on is not None and bounds is not None):
+        raise typer.BadParameter("--height, --plane, --on: give one; --bounds goes with a plane")
     question = parse_quality(quality, changes)
     report.refuse_taken(out, overwrite)
-    edited = _edited(_read(scene), move, replace, without, None)
+    band = bandwidth or 20e6
+    edited = _edited(_read(scene, asset_root, variant, time), move, replace, without, None)
     shown = None if transmitter is None else _transmitter(edited, transmitter)
-    where = _device(device)
+    options: dict[str, Any] = {"quality": question, "seed": seed, "device": _device(device)}
+    options |= {} if cell is None else {"cell": cell}
+    options |= {} if method is None else {"method": method.value}
+    where: dict[str, Any] = {} if height is None else {"height": height}
+    where |= {} if plane is None else {"plane": parse_plane(plane)}
+    if bounds is not None:
+        where["bounds"] = parse_numbers(bounds, 4, "four numbers in metres, as in 0,0,8,5")
     from rfsg.tracer import radiomap
 
-    with _bar() as progress:
+    with bar() as progress:
         progress("radio map")
-        found = radiomap.radio_map(
-            edited,
-            frequency,
-            height=height,
-            cell=cell,
-            quality=question,
-            method=method.value,
-            seed=seed,
-            device=where,
-        )
+        if on is not None:
+            found = radiomap.radio_map_on(edited, on, frequency, offset=offset, **options)
+        else:
+            found = radiomap.radio_map(edited, frequency, **where, **options)
     asked = {"scene": str(scene), "move": move, "replace": replace, "without": without}
-    asked |= {"frequency_hz": found.frequency, "height": height, "cell": cell}
-    asked |= {"method": method.value, "seed": seed, "device": device, "quality": question}
-    asked |= {"warnings": edited.warnings, "versions": report.versions()}
+    asked |= {"asset_roots": asset_root, "variants": variant, "time_code": time}
+    asked |= {"frequency_hz": found.frequency, "cells": list(found.cells.shape), "cell": cell}
+    asked |= {"height": height, "plane": plane, "bounds": bounds, "on": on, "offset": offset}
+    asked |= {"metric": metric.value, "bandwidth_hz": band, "noise_figure_db": noise_figure}
+    asked |= {"method": found.method, "seed": seed, "device": device, "quality": question}
+    asked |= {"modelled": found.modelled, "left_out": found.left_out}
+    asked |= {"warnings": found.warnings, "versions": report.versions()}
     from rfsg import plot
 
     with report.output_folder(out, overwrite) as folder:
-        report.write_map(found, folder / "map.npz")
+        report.write_map(found, folder / "map.npz", band, noise_figure)
         report.write_json(asked, folder / "report.json")
-        plot.save(plot.map_figure(found, edited, shown), folder / "map.png")
-    _print_files(out, ("map.npz", "map.png"))
+        figure = plot.map_figure(found, edited, shown, metric.value, band, noise_figure)
+        plot.save(figure, folder / "map.png")
+    for warning in found.warnings:
+        note(warning)
+    print_files(out, ("map.npz", "map.png", "report.json"))
 
 
 @app.command()
-def check(file: AnyFile) -> None:
+def check(file: AnyFile, asset_root: Roots = [], variant: Variants = [], time: Time = None) -> None:
     """List every fault of a scene or an asset; exit code 3 if there is one."""
     _must_exist(file)
     from rfsg.scene import usd
 
-    faults = usd.check(file)
+    faults = usd.check(file, **_reading(asset_root, variant, time))
     for fault in faults:
         typer.echo(fault)
     if faults:
@@ -290,22 +383,25 @@ def info(
     parameters: Annotated[
         bool, typer.Option("--parameters", help="Also list every parameter tensor.")
     ] = False,
+    asset_root: Roots = [],
+    variant: Variants = [],
+    time: Time = None,
 ) -> None:
     """Print what a scene or an asset holds: objects, kinds, parameter counts, radios."""
     from rfsg import report
 
-    scene = _read(file)
-    _print_table(f"{file}", report.scene_table(scene))
+    scene = _read(file, asset_root, variant, time)
+    print_table(f"{file}", report.scene_table(scene))
     if parameters:
-        _print_table("parameters", report.parameter_table(scene))
+        print_table("parameters", report.parameter_table(scene))
     radios = [("transmitter", r) for r in scene.transmitters]
     radios += [("receiver", r) for r in scene.receivers]
     if radios:
-        _print_table("radios", [_radio_row(role, radio) for role, radio in radios])
+        print_table("radios", [_radio_row(role, radio) for role, radio in radios])
     if scene.frequency is not None:
         typer.echo(f"frequency: {scene.frequency / 1e9:g} GHz")
     for warning in scene.warnings:
-        _note(warning)
+        note(warning)
 
 
 @app.command(name="learn-shape")
@@ -336,7 +432,7 @@ def learn_shape(
 
     options: dict[str, Any] = {} if steps is None else {"steps": steps}
     options |= {} if up is None else {"up_axis": up.value}
-    with _bar() as progress:
+    with bar() as progress:
         outcome = learn_shape_file(
             mesh,
             asset,
@@ -347,8 +443,8 @@ def learn_shape(
             overwrite=overwrite,
             **options,
         )
-    rows = [{"quantity": k, "value": _short(v)} for k, v in vars(outcome).items()]
-    _print_table(f"{asset}", rows)
+    rows = [{"quantity": k, "value": short(v)} for k, v in vars(outcome).items()]
+    print_table(f"{asset}", rows)
 
 
 @app.callback(invoke_without_command=True)
@@ -388,26 +484,28 @@ def _is_ours(error: Exception) -> bool:
     return type(error).__module__.split(".")[0] == "rfsg"
 
 
-def _say(sentence: str, code: int) -> int:
-    for line in sentence.splitlines():
-        typer.echo(f"rfsg: {line}", err=True)
-    return code
-
-
-def _note(sentence: str) -> None:
-    typer.echo(f"note: {sentence}", err=True)
-
-
 def _must_exist(file: Path) -> None:
     if not file.exists() or file.is_dir():
         raise FileNotFoundError(2, "no such file", str(file))
 
 
-def _read(file: Path) -> "Scene":
+def _read(file: Path, roots: list[Path], variants: list[str], time: float | None) -> "Scene":
     _must_exist(file)
+    options = _reading(roots, variants, time)
     from rfsg.scene.scene import Scene
 
-    return Scene.from_usd(file)
+    return Scene.from_usd(file, **options)
+
+
+def _reading(roots: list[Path], variants: list[str], time: float | None) -> dict[str, Any]:
+    """The options of ``rfsg.scene.usd.read`` that were given."""
+    for root in roots:
+        if not root.is_dir():
+            raise typer.BadParameter(f"--asset-root {root}: no such folder")
+    if time is not None and not math.isfinite(time):
+        raise typer.BadParameter(f"--time {time}: expected a finite time code")
+    chosen = parse_variants(variants)
+    return {"asset_roots": roots, "variants": chosen, "time": time}
 
 
 def _edited(
@@ -487,7 +585,7 @@ def _draw_run(
 def _print_links(result: Any) -> None:
     rows = result.links()
     most = 30
-    _print_table(
+    print_table(
         "links",
         [
             {
@@ -512,62 +610,6 @@ def _radio_row(role: str, radio: Any) -> dict[str, Any]:
     row = {"path": radio.path, "role": role, "at [m]": place, "power [dBm]": power}
     array = "" if radio.array is None else radio.array
     return row | {"pattern": radio.pattern, "polarization": radio.polarization, "array": array}
-
-
-def _print_files(out: Path, names: tuple[str, ...]) -> None:
-    for name in names:
-        typer.echo(str(out / name))
-
-
-def _print_table(title: str, rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for name in rows[0] if rows else ():
-        table.add_column(name, no_wrap=name in ("path", "tx", "rx"))
-    for row in rows:
-        table.add_row(*(str(value) for value in row.values()))
-    terminal = Console()
-    # Piped output has no width of its own: leave lines whole, for grep and awk.
-    (terminal if terminal.is_terminal else Console(width=200)).print(table, markup=False)
-
-
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
-@contextmanager
-def _bar() -> Iterator[Callable[..., None]]:
-    """progress(stage) or progress(stage, done, total, note): bars on stderr; quiet when piped.
-
-    A stage without counts is over when the next one begins.
-    """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    console = Console(stderr=True)
-    tasks: dict[str, Any] = {}
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-
-        def progress(
-            stage: str, done: float | None = None, total: float | None = None, note: str = ""
-        ) -> None:
-            if stage not in tasks:
-                _finish(bars)
-                tasks[stage] = bars.add_task(stage, total=total)
-            if done is not None:
-                text = f"{stage}: {note}" if note else stage
-                bars.update(tasks[stage], completed=done, total=total, description=text)
-
-        yield progress
-        _finish(bars)
-
-
-def _finish(bars: Any) -> None:
-    for task in bars.tasks:
-        bars.update(task.id, completed=task.total or 1, total=task.total or 1)
 
 
 if __name__ == "__main__":

@@ -12,23 +12,28 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Normalize
+from matplotlib.colors import ListedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.patheffects import withStroke
-from mpl_toolkits.mplot3d.art3d import Line3DCollection
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy.spatial import ConvexHull
 
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
+from rfsg.tracer.cells import Grid
+from rfsg.tracer.patches import Patches
+from rfsg.tracer.radiomap import RadioMap
 
 MOST_PATHS = 300  # more lines than this only blacken a picture; the strongest are drawn
 DYNAMIC_RANGE_DB = 45.0  # below the strongest path; weaker ones are not drawn
 MOST_NAMES = 12  # more labels than this cover what they name
 SLICES = 7  # horizontal cuts that show a curved or learned object in 3-D
+CUT = 240  # samples each way where a plane cuts an object
 GRID = (56, 56, 28)  # samples of an implicit function across an object's bounds
 
 _EDGE = "#2f3b4a"
@@ -38,6 +43,7 @@ _TX = "#c0392b"
 _RX = "#1f6fb2"
 _PATHS = "plasma_r"
 _MAP = "viridis"
+_NOTHING = "#d8d8d8"
 _BOX_EDGES = [(i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step]
 
 
@@ -115,34 +121,132 @@ def delay_figure(scene: Scene, channel: Any, links: Sequence[tuple[int, int]]) -
 
 
 def map_figure(
-    radio_map: Any, scene: Scene, transmitter: int | None = None, title: str = ""
+    radio_map: RadioMap,
+    scene: Scene,
+    transmitter: int | None = None,
+    metric: str = "rss",
+    bandwidth_hz: float = 20e6,
+    noise_figure_db: float = 0.0,
+    title: str = "",
 ) -> Figure:
-    """Received power [dBm] over a plane, with the objects that stand in it.
+    """A map as a picture: on a plane with the objects that stand in it, on a surface in space.
 
-    transmitter: its index; None shows the strongest in each cell. Grey where nothing arrives.
+    transmitter: its index; None shows the best in each cell. metric: "rss", "path-loss", "sinr"
+    (over noise in ``bandwidth_hz``) or "best-server". Grey where nothing arrives. Raises ValueError
+    for another metric.
     """
-    x, y = _numpy(radio_map.x), _numpy(radio_map.y)
-    best = transmitter is None
-    level = _numpy(radio_map.best_dbm() if best else radio_map.rss_dbm()[transmitter])
-    level = np.ma.masked_invalid(level)
-    width, depth = np.ptp(_edges(x)), np.ptp(_edges(y))
-    figure = Figure(figsize=(8.5, 1.6 + 7.0 * min(1.4, depth / width)), layout="constrained")
-    axes = figure.add_subplot()
-    known = level.compressed()
-    low, high = np.percentile(known, (1, 99.5)) if known.size else (0.0, 1.0)
-    image = axes.pcolormesh(_edges(x), _edges(y), level, cmap=_MAP, vmin=low, vmax=high)
-    axes.set_facecolor("#d8d8d8")
-    for ring in (ring for node in scene.nodes for ring in footprint(node)):
-        halo = [withStroke(linewidth=2.2, foreground="black", alpha=0.5)]
-        axes.add_patch(Polygon(ring, fill=False, edgecolor="white", path_effects=halo))
-    _radios(axes, scene, receivers=False)
-    axes.set(xlim=_ends(_edges(x)), ylim=_ends(_edges(y)))
-    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    figure.colorbar(image, ax=axes, shrink=0.85).set_label("received signal strength [dBm]")
-    whose = "strongest signal" if best and len(scene.transmitters) > 1 else "signal"
-    text = title or f"{whose} at z = {float(radio_map.height):g} m"
-    axes.set_title(text, loc="right", fontsize=11)
+    value, label = metric_values(radio_map, transmitter, metric, bandwidth_hz, noise_figure_db)
+    look = _map_look(value, len(scene.transmitters) if metric == "best-server" else None)
+    cells = radio_map.cells
+    if isinstance(cells, Patches):
+        figure, axes = _surface_figure(cells, value, look)
+        place = f"on {cells.name}"
+    else:
+        figure, axes = _plane_figure(cells, scene, value, look)
+        place = f"at z = {float(cells.plane.translation[2]):g} m" if _is_level(cells.plane) else ""
+    bar = figure.colorbar(ScalarMappable(look["norm"], look["cmap"]), ax=axes, shrink=0.85)
+    if metric == "best-server":
+        names = [_name(radio.path) for radio in scene.transmitters]
+        bar.set_ticks(range(len(names)), labels=names)
+    bar.set_label(label)
+    axes.set_title(title or place, loc="right", fontsize=11)
     return figure
+
+
+def metric_values(
+    radio_map: RadioMap,
+    transmitter: int | None,
+    metric: str,
+    bandwidth_hz: float,
+    noise_figure_db: float,
+) -> tuple[np.ma.MaskedArray, str]:
+    """Values per cell of one transmitter, or of the best (None), masked where there are none; label.
+
+    Raises ValueError for an unknown metric.
+    """
+    if metric == "best-server":
+        best = _numpy(radio_map.best_server())
+        return np.ma.masked_less(best, 0), "best server"
+    if metric == "rss":
+        every, label = radio_map.rss_dbm(), "received signal strength [dBm]"
+    elif metric == "path-loss":
+        every, label = -radio_map.path_loss_db(), "path loss [dB]"  # the best has the least
+    elif metric == "sinr":
+        every, label = radio_map.sinr_db(bandwidth_hz, noise_figure_db), "SINR [dB]"
+    else:
+        raise ValueError(f"metric {metric!r}: expected rss, path-loss, sinr or best-server")
+    silence = np.full((1, *radio_map.cells.shape), -np.inf)
+    shown = _numpy(every) if transmitter is None else _numpy(every)[[transmitter]]
+    value = np.ma.masked_invalid(np.concatenate([silence, shown]).max(axis=0))
+    return (-value if metric == "path-loss" else value), label
+
+
+def _map_look(value: np.ma.MaskedArray, servers: int | None) -> dict[str, Any]:
+    """Colours and their range: the bulk of the values, or one colour for each server."""
+    if servers is not None:
+        count = max(1, servers)
+        colours = colormaps["tab20"].resampled(min(20, count)) if count > 10 else colormaps["tab10"]
+        cmap = ListedColormap([colours(i % colours.N) for i in range(count)])
+        return {"cmap": cmap, "norm": Normalize(-0.5, count - 0.5)}
+    known = value.compressed()
+    low, high = np.percentile(known, (1, 99.5)) if known.size else (0.0, 1.0)
+    return {"cmap": colormaps[_MAP], "norm": Normalize(low, high)}
+
+
+def _plane_figure(
+    cells: Grid, scene: Scene, value: np.ma.MaskedArray, look: dict[str, Any]
+) -> tuple[Figure, Axes]:
+    x, y = _edges(_numpy(cells.x), cells.cell), _edges(_numpy(cells.y), cells.cell)
+    tall = min(1.4, np.ptp(y) / np.ptp(x))
+    figure = Figure(figsize=(8.5, 1.6 + 7.0 * tall), layout="constrained")
+    axes = figure.add_subplot()
+    axes.pcolormesh(x, y, value, **look)
+    axes.set_facecolor(_NOTHING)
+    level = _is_level(cells.plane)
+    for node in scene.nodes:
+        for ring in footprint(node) if level else cut(node, cells.plane, _ends(x), _ends(y)):
+            halo = [withStroke(linewidth=2.2, foreground="black", alpha=0.5)]
+            axes.add_patch(Polygon(ring, fill=False, edgecolor="white", path_effects=halo))
+    if level:
+        _radios(axes, scene, receivers=False)
+    axes.set(xlim=_ends(x), ylim=_ends(y), aspect="equal")
+    axes.set(xlabel="x [m]" if level else "along u [m]", ylabel="y [m]" if level else "along v [m]")
+    return figure, axes
+
+
+def _surface_figure(
+    cells: Patches, value: np.ma.MaskedArray, look: dict[str, Any]
+) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(9.0, 7.0), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    triangles = _numpy(cells.triangle)
+    colours = look["cmap"](look["norm"](value.filled(0.0)))
+    colours[np.ma.getmaskarray(value)] = to_rgba(_NOTHING)
+    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors="none"))
+    corner = triangles.reshape(-1, 3)
+    _frame_space(axes, corner.min(axis=0), corner.max(axis=0))
+    return figure, axes
+
+
+def cut(
+    node: Node, plane: Pose, x: tuple[float, float], y: tuple[float, float]
+) -> list[Float[np.ndarray, "_ 2"]]:
+    """Outlines of an object within a plane [m], in the plane's frame, over a window of it."""
+    across, up = (np.linspace(low, high, CUT) for low, high in (x, y))
+    grid = np.stack([*np.meshgrid(across, up), np.zeros((CUT, CUT))], axis=-1).reshape(-1, 3)
+    point = node.pose.point_object(plane.point_world(torch.tensor(grid))).detach()
+    low, high = node.body.shape.bounds().detach()
+    beyond = (point - point.clamp(low, high)).norm(dim=-1)  # there a learned shape means nothing
+    with torch.no_grad():
+        parts = point.clamp(low, high).to(_dtype(node)).split(16_384)
+        value = torch.cat([node.body.shape.sdf(part) for part in parts]).double() + beyond
+    return _contours(across, up, _numpy(value).reshape(CUT, CUT))
+
+
+def _is_level(plane: Pose) -> bool:
+    """Whether x and y of the plane are those of the world."""
+    turned = torch.equal(plane.rotation.cpu(), torch.eye(3, dtype=torch.float64))
+    return turned and not bool(plane.translation[:2].any())
 
 
 def comparison_figure(
@@ -276,11 +380,16 @@ def _draw_space(axes: Any, scene: Scene) -> None:
         look: dict[str, Any] = {"linewidths": 0.9 if thing else 0.5, "alpha": 1.0 if thing else 0.5}
         if edges:
             axes.add_collection3d(Line3DCollection(edges, colors=_EDGE, **look))
-    size = np.maximum(high - low, 0.1 * (high - low).max() + 1e-3)
     for radios, colour, mark in ((scene.transmitters, _TX, "^"), (scene.receivers, _RX, ".")):
         if radios:
             place = np.stack([_numpy(radio.position) for radio in radios])
             axes.plot(*place.T, mark, color=colour, markersize=7)
+    _frame_space(axes, low, high)
+
+
+def _frame_space(axes: Any, low: np.ndarray, high: np.ndarray) -> None:
+    """Limits, view and labels of a picture in space [m], no side of it quite flat."""
+    size = np.maximum(high - low, 0.1 * (high - low).max() + 1e-3)
     axes.set(xlim=(low[0], low[0] + size[0]), ylim=(low[1], low[1] + size[1]))
     axes.set(zlim=(low[2], low[2] + size[2]))
     axes.set_box_aspect(size)
@@ -339,10 +448,9 @@ def _dtype(node: Node) -> torch.dtype:
     return torch.float64 if node.body.shape.exact else torch.float32
 
 
-def _edges(centre: np.ndarray) -> np.ndarray:
-    """Edges of cells with these centres; a single cell is a metre wide."""
-    step = centre[1] - centre[0] if len(centre) > 1 else 1.0
-    return np.concatenate([centre - step / 2, centre[-1:] + step / 2])
+def _edges(centre: np.ndarray, cell: float) -> np.ndarray:
+    """Edges of cells with these middles."""
+    return np.concatenate([centre - cell / 2, centre[-1:] + cell / 2])
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:

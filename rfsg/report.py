@@ -155,12 +155,13 @@ def angles_deg(direction: np.ndarray) -> np.ndarray:
     return np.degrees(np.stack([azimuth, elevation], axis=-1))
 
 
-def write_channel(result: Any, file: Path) -> None:
+def write_channel(result: Any, file: Path, responses: dict[str, Any] | None = None) -> None:
     """channel.npz: the whole channel and its paths as arrays; ``np.load`` needs no pickle.
 
     gain [p, f] complex, delay [p] s, frequency [f] Hz, doppler [p] Hz, departure and arrival
     [p, 3], tx and rx [p] into tx_paths and rx_paths, which [p, d] and crossed [x, 3] into
-    node_paths (-1 pads), vertices [p, d+2, 3] m, status [p], path_gain [tx, rx, f] linear. Where a
+    node_paths (-1 pads), act and item [p, d] as in ``records.Paths``, vertices [p, d+2, 3] m, status
+    [p], path_gain [tx, rx, f] linear; with ``responses``, what ``response_arrays`` gives. Where a
     radio has several ports: mimo [tx, rx, f, ports of rx, ports of tx], zeros beyond the
     mimo_tx_ports [tx] and mimo_rx_ports [rx] that each has.
     """
@@ -169,14 +170,66 @@ def write_channel(result: Any, file: Path) -> None:
     arrays: dict[str, Any] = {
         name: _numpy(getattr(channel, name)) for name in (*names, "crossed", "blocked")
     }
-    arrays |= {name: _numpy(getattr(paths, name)) for name in ("which", "vertices", "status")}
+    shared = ("which", "act", "item", "vertices", "status")
+    arrays |= {name: _numpy(getattr(paths, name)) for name in shared}
     arrays |= {
         "path_gain": _numpy(result.path_gain()),
         "tx_paths": np.array([radio.path for radio in scene.transmitters], dtype=str),
         "rx_paths": np.array([radio.path for radio in scene.receivers], dtype=str),
         "node_paths": np.array([node.path for node in scene.nodes], dtype=str),
     }
-    np.savez_compressed(file, **arrays, **_mimo_arrays(result))
+    np.savez_compressed(file, **arrays, **(responses or {}), **_mimo_arrays(result))
+
+
+def response_arrays(
+    result: Any,
+    bandwidth_hz: float | None = None,
+    subcarriers: int = 64,
+    snapshots: int | None = None,
+    duration_s: float | None = None,
+) -> dict[str, Any]:
+    """What a channel does to a signal, about each frequency f of the run, for channel.npz.
+
+    With ``snapshots``: time [s], evenly over ``duration_s`` from 0; transfer [tx, rx, f, s]. With a
+    bandwidth: subcarrier_frequency [f, k] Hz, cfr [tx, rx, f, s, k]; taps [tx, rx, f, s, l], the
+    first of which is tap number first_tap; bandwidth. Raises ValueError for what makes no response.
+    """
+    import torch
+
+    from rfsg.tracer import response
+
+    size = len(result.scene.transmitters), len(result.scene.receivers)
+    time = torch.zeros(1, dtype=torch.float64)
+    if snapshots is not None:
+        if not (snapshots >= 1 and duration_s and 0 < duration_s < float("inf")):
+            raise ValueError(f"{snapshots} snapshots over {duration_s} s: expected both above 0")
+        time = torch.arange(snapshots, dtype=torch.float64) * (duration_s / snapshots)
+    carriers = [
+        response.at_carrier(result.channel, k) for k in range(len(result.channel.frequency))
+    ]
+
+    def over(bands: list[Any]) -> np.ndarray:
+        found = zip(carriers, bands, strict=True)
+        parts = [response.frequency_response(one, *size, band, time) for one, band in found]
+        return _numpy(torch.stack(parts, 2))
+
+    arrays: dict[str, Any] = {}
+    if snapshots is not None:
+        arrays |= {"time": _numpy(time), "transfer": over([c.frequency for c in carriers])[..., 0]}
+    if bandwidth_hz is not None:
+        bands = [
+            response.subcarriers(float(f), bandwidth_hz, subcarriers)
+            for f in result.channel.frequency
+        ]
+        sampled = [response.taps(one, *size, bandwidth_hz, time=time) for one in carriers]
+        arrays |= {
+            "bandwidth": float(bandwidth_hz),
+            "subcarrier_frequency": np.stack([_numpy(band) for band in bands]),
+            "cfr": over(bands),
+            "taps": _numpy(torch.stack([t.gain for t in sampled], 2)),
+            "first_tap": sampled[0].first,
+        }
+    return arrays
 
 
 def _mimo_arrays(result: Any) -> dict[str, Any]:
@@ -200,21 +253,37 @@ def _mimo_arrays(result: Any) -> dict[str, Any]:
     }
 
 
-def write_map(radio_map: Any, file: Path) -> None:
-    """map.npz: x [nx] and y [ny], cell centres in m; path_gain [tx, ny, nx] linear, error_db and
-    rss_dbm alike; tx_paths, height [m], cell [m], frequency [Hz]."""
-    radios = radio_map.scene.transmitters
+def write_map(
+    radio_map: Any, file: Path, bandwidth_hz: float = 20e6, noise_figure_db: float = 0.0
+) -> None:
+    """map.npz: path_gain [tx, *c] linear; error_db, path_loss_db, rss_dbm and sinr_db alike;
+    best_server [*c], -1 for none; tx_paths, frequency, bandwidth and noise_figure_db of the SINR.
+
+    On a plane *c is [ny, nx]: cell [m], x [nx] and y [ny], the cells' middles in the plane, which
+    stand at origin + x u + y v in the world. On a surface it is [c]: triangle [c, 3, 3], point and
+    normal [c, 3], area [c].
+    """
+    cells = radio_map.cells
+    names = (
+        ("x", "y", "cell") if hasattr(cells, "plane") else ("triangle", "point", "normal", "area")
+    )
+    arrays: dict[str, Any] = {name: _numpy(getattr(cells, name)) for name in names}
+    if hasattr(cells, "plane"):
+        u, v = _numpy(cells.plane.rotation).T[:2]
+        arrays |= {"origin": _numpy(cells.plane.translation), "u": u, "v": v}
     np.savez_compressed(
         file,
-        x=_numpy(radio_map.x),
-        y=_numpy(radio_map.y),
+        **arrays,
         path_gain=_numpy(radio_map.path_gain),
         error_db=_numpy(radio_map.error_db),
+        path_loss_db=_numpy(radio_map.path_loss_db()),
         rss_dbm=_numpy(radio_map.rss_dbm()),
-        tx_paths=np.array([radio.path for radio in radios], dtype=str),
-        height=float(radio_map.height),
-        cell=float(radio_map.cell),
+        sinr_db=_numpy(radio_map.sinr_db(bandwidth_hz, noise_figure_db)),
+        best_server=_numpy(radio_map.best_server()),
+        tx_paths=np.array([radio.path for radio in radio_map.scene.transmitters], dtype=str),
         frequency=float(radio_map.frequency),
+        bandwidth=float(bandwidth_hz),
+        noise_figure_db=float(noise_figure_db),
     )
 
 

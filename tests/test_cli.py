@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import typer
 
-from rfsg import cli
+from rfsg import cli, parse
 
 SCENE = """#usda 1.0
 (
@@ -74,7 +74,11 @@ def faked(monkeypatch, small_run, tmp_path):
         options["progress"]("search")
         return small_run
 
-    monkeypatch.setattr(Scene, "from_usd", staticmethod(lambda path: small_run.scene))
+    def read(path, **options):
+        asked["reading"] = options
+        return small_run.scene
+
+    monkeypatch.setattr(Scene, "from_usd", staticmethod(read))
     monkeypatch.setattr("rfsg.tracer.simulate.simulate", simulate)
     asked["file"] = tmp_path / "made_by_hand.usda"
     asked["file"].write_text("#usda 1.0\n")
@@ -87,7 +91,7 @@ def faked(monkeypatch, small_run, tmp_path):
     + [("100kHz", 1e5), ("1.5e2 Hz", 150.0), ("0.3THz", 3e11)],
 )
 def test_frequencies_have_units(text, hertz):
-    assert cli.parse_frequency(text) == pytest.approx(hertz, rel=1e-15)
+    assert parse.parse_frequency(text) == pytest.approx(hertz, rel=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -95,15 +99,54 @@ def test_frequencies_have_units(text, hertz):
 )
 def test_what_is_not_a_frequency_is_refused(text):
     with pytest.raises(typer.BadParameter, match="frequency"):
-        cli.parse_frequency(text)
+        parse.parse_frequency(text)
+
+
+def test_frequencies_come_in_lists_and_again():
+    found = parse.parse_frequencies(["2.4GHz,5GHz", "60 GHz"])
+    assert found == pytest.approx([2.4e9, 5e9, 60e9]) and parse.parse_frequencies([]) == []
+    with pytest.raises(typer.BadParameter, match="frequency"):
+        parse.parse_frequencies(["2.4GHz,"])
+    with pytest.raises(typer.BadParameter, match="at most"):
+        parse.parse_frequencies(["1GHz," * 20_000 + "1GHz"])
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("10ms", 0.01), ("2.5 us", 2.5e-6), ("1e-3", 1e-3), ("3S", 3.0)]
+)
+def test_durations_have_units(text, seconds):
+    assert parse.parse_duration(text) == pytest.approx(seconds, rel=1e-15)
+
+
+@pytest.mark.parametrize("text", ["", "ms", "-1s", "0", "inf", "1min", "1e400"])
+def test_what_is_not_a_duration_is_refused(text):
+    with pytest.raises(typer.BadParameter, match="duration"):
+        parse.parse_duration(text)
+
+
+def test_planes_and_variants_are_read():
+    plane = parse.parse_plane("0,2,0.5:1,0,0:0,0,2")
+    assert plane.translation.tolist() == [0.0, 2.0, 0.5]
+    assert plane.rotation.T.tolist() == [[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]
+    for wrong in ("0,0,0", "0,0,0:1,0,0:2,0,0", "0,0,0:1,0:0,1,0", "0,0,nan:1,0,0:0,1,0"):
+        with pytest.raises(typer.BadParameter):
+            parse.parse_plane(wrong)
+    texts = ["/World/Door:state=open", "/World/Door:look=red", "/A:b=c"]
+    assert parse.parse_variants(texts) == {
+        "/World/Door": {"state": "open", "look": "red"},
+        "/A": {"b": "c"},
+    }
+    for wrong in ("/World/Door", "/World/Door:state", ":state=open", "/A:=b"):
+        with pytest.raises(typer.BadParameter, match="PRIM:SET=NAME"):
+            parse.parse_variants([wrong])
 
 
 def test_quality_fields_keep_their_types():
-    quality = cli.parse_quality("draft", ["depth=4", "epsilon=0.02", "integral=riemann"])
+    quality = parse.parse_quality("draft", ["depth=4", "epsilon=0.02", "integral=riemann"])
     assert (quality.depth, quality.epsilon, quality.integral) == (4, 0.02, "riemann")
     for wrong in ("depth=deep", "nonsense=1", "depth"):
         with pytest.raises(typer.BadParameter):
-            cli.parse_quality("draft", [wrong])
+            parse.parse_quality("draft", [wrong])
 
 
 def test_simulate_writes_everything(faked, tmp_path, capsys):
@@ -115,12 +158,35 @@ def test_simulate_writes_everything(faked, tmp_path, capsys):
     assert {file.name for file in out.iterdir()} == names
     report = json.loads((out / "report.json").read_text())
     assert report["move"] == ["/World/Wall=1,0,-0.5"] and report["seed"] == 0
-    assert faked["frequency"] == 1e9 and faked["quality"].depth == 1
+    assert faked["frequency"].tolist() == [1e9] and faked["quality"].depth == 1
+    assert faked["reading"] == {"asset_roots": [], "variants": {}, "time": None}
     (wall,) = faked["scene"].nodes
     assert wall.pose.translation.tolist() == [3.0, 3.0, 1.0]
     printed = capsys.readouterr()
     assert str(out / "scene.png") in printed.out and "/World/rx_1" in printed.out
     assert printed.err == "note: a warning\n"  # piped: no progress bar
+
+
+def test_responses_over_band_and_time_are_written(faked, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["simulate", str(faked["file"]), "--out", str(out), "--frequency", "1GHz,2GHz"]
+    options = ["--bandwidth", "20MHz", "--subcarriers", "16", "--snapshots", "4"]
+    assert cli.run([*arguments, "--frequency", "3GHz", *options, "--duration", "2ms"]) == 0
+    assert faked["frequency"].tolist() == [1e9, 2e9, 3e9]
+    with np.load(out / "channel.npz", allow_pickle=False) as stored:  # the made-up run has one f
+        assert stored["cfr"].shape == (1, 2, 1, 4, 16)
+        assert stored["taps"].shape[:4] == (1, 2, 1, 4)
+        assert stored["time"].tolist() == pytest.approx([0.0, 5e-4, 1e-3, 1.5e-3])
+    report = json.loads((out / "report.json").read_text())
+    assert (report["bandwidth_hz"], report["subcarriers"], report["duration_s"]) == (2e7, 16, 2e-3)
+
+
+def test_reading_options_reach_the_reader(faked, tmp_path):
+    arguments = ["simulate", str(faked["file"]), "--out", str(tmp_path / "o")]
+    options = ["--asset-root", str(tmp_path), "--variant", "/World/Door:state=open", "--time", "24"]
+    assert cli.run([*arguments, *options]) == 0
+    expected = {"asset_roots": [tmp_path], "variants": {"/World/Door": {"state": "open"}}}
+    assert faked["reading"] == expected | {"time": 24.0}
 
 
 def test_receivers_come_from_a_table(faked, tmp_path):
@@ -157,6 +223,24 @@ def test_results_are_not_overwritten_unasked(faked, tmp_path, capsys):
         (["simulate", "nowhere.usda", "--out", "o"], 3, "nowhere.usda"),
         (["learn-shape", "nowhere.obj", "-o", "a.usda"], 3, "nowhere.obj"),
         (["learn-shape", "FILE", "-o", "a.usda", "--up", "W"], 2, "--up"),
+        (["simulate", "FILE", "--out", "o", "--frequency", "2.4GHz,five"], 2, "'five'"),
+        (["simulate", "FILE", "--out", "o", "--subcarriers", "8"], 2, "--bandwidth"),
+        (["simulate", "FILE", "--out", "o", "--snapshots", "8"], 2, "--duration"),
+        (["simulate", "FILE", "--out", "o", "--duration", "1ms"], 2, "--snapshots"),
+        (["simulate", "FILE", "--out", "o", "--bandwidth", "4GHz"], 3, "below the carrier"),
+        (["simulate", "FILE", "--out", "o", "--asset-root", "nowhere"], 2, "nowhere"),
+        (["simulate", "FILE", "--out", "o", "--variant", "/A"], 2, "PRIM:SET=NAME"),
+        (["simulate", "FILE", "--out", "o", "--time", "nan"], 2, "time code"),
+        (["map", "FILE", "--out", "o", "--height", "1", "--on", "/World/Wall"], 2, "give one"),
+        (
+            ["map", "FILE", "--out", "o", "--on", "/World/Wall", "--bounds", "0,0,1,1"],
+            2,
+            "--bounds",
+        ),
+        (["map", "FILE", "--out", "o", "--plane", "0,0,0:1,0,0"], 2, "ORIGIN:U:V"),
+        (["map", "FILE", "--out", "o", "--bounds", "0,0,1"], 2, "four numbers"),
+        (["map", "FILE", "--out", "o", "--metric", "luck"], 2, "luck"),
+        (["map", "FILE", "--out", "o", "--on", "/World/Wal"], 3, "/World/Wal:"),
         (["dance"], 2, "dance"),
     ],
 )
@@ -229,7 +313,33 @@ def test_a_map_of_a_real_scene(scene_file, tmp_path, capsys):
     with np.load(out / "map.npz", allow_pickle=False) as stored:
         size = (1, len(stored["y"]), len(stored["x"]))
         assert stored["path_gain"].shape == stored["error_db"].shape == size
+        assert stored["origin"].tolist() == [0.0, 0.0, 1.2]
         assert not np.isnan(stored["path_gain"]).any()
+    report = json.loads((out / "report.json").read_text())
+    assert any("rays" in line for line in report["modelled"])
+    assert any("diffraction" in line for line in report["left_out"])
+
+
+def test_maps_on_other_planes_and_on_objects(scene_file, tmp_path):
+    arguments = ["map", str(scene_file), "--quality", "draft", "--set", "map_rays=2000"]
+    upright = ["--plane", "0,1,0:1,0,0:0,0,1", "--bounds", "0,0,4,2", "--metric", "sinr"]
+    options = ["--bandwidth", "1MHz", "--noise-figure", "5", "--method", "paths"]
+    assert cli.run([*arguments, "--out", str(tmp_path / "a"), *upright, *options]) == 0
+    with np.load(tmp_path / "a" / "map.npz", allow_pickle=False) as stored:
+        assert stored["path_gain"].shape == (1, 4, 8) and stored["v"].tolist() == [0, 0, 1]
+        noise = -173.975 + 60.0 + 5.0
+        heard = np.isfinite(stored["rss_dbm"])
+        expected = (stored["rss_dbm"] - noise)[heard]
+        assert stored["sinr_db"][heard] == pytest.approx(expected, abs=1e-3)
+    on = ["--on", "/World/Cabinet", "--cell", "0.7", "--metric", "best-server"]
+    assert cli.run([*arguments, "--out", str(tmp_path / "b"), *on]) == 0
+    with np.load(tmp_path / "b" / "map.npz", allow_pickle=False) as stored:
+        # a cabinet of 1 x 0.5 x 2 m
+        assert stored["area"].sum() == pytest.approx(2 * (0.5 + 1.0 + 2.0))
+        facing = stored["normal"][:, 1] < -0.5  # the side before the transmitter
+        assert np.isfinite(stored["rss_dbm"][0, facing]).all()
+    report = json.loads((tmp_path / "b" / "report.json").read_text())
+    assert (report["method"], report["on"]) == ("paths", "/World/Cabinet")
 
 
 def test_check_and_info(scene_file, capsys):

@@ -1,7 +1,5 @@
 """Pictures: what is drawn lies where the objects are, and every figure can be made and saved."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import torch
@@ -11,7 +9,12 @@ from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Box, Cylinder, HalfSpace, Sphere
 from rfsg.objects.surfaces.interface import Conductor
 from rfsg.scene.pose import Pose
+from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Node, Scene
+from rfsg.scene.world import World
+from rfsg.tracer.cells import grid_on, plane_through
+from rfsg.tracer.patches import patches_of
+from rfsg.tracer.radiomap import RadioMap
 
 
 def node(shape, pose=None, path="/World/Thing"):
@@ -65,12 +68,30 @@ def test_path_lines_drop_the_padding_and_the_blocked(small_run):
     assert gain_db[-1] == pytest.approx(20 * np.log10(0.0239 / 4.0))
 
 
+def map_of(scene, cells, gain):
+    error = torch.zeros_like(gain)
+    return RadioMap(scene, 1e9, cells, gain, error, "paths")
+
+
+def level():
+    return grid_on(Pose.at(0.0, 0.0, 1.2), (0.0, 0.0, 3.0, 2.5), 0.5)
+
+
+def gains(*shape):
+    value = torch.logspace(-9, -4, int(np.prod(shape)), dtype=torch.float64).reshape(shape)
+    value[:, 0] = 0.0  # nothing arrives there
+    return value
+
+
 def test_figures_are_saved_as_pictures(small_run, tmp_path):
     scene = small_run.scene
-    rss = torch.linspace(-80.0, -40.0, 60).reshape(2, 5, 6)
-    rss[:, 0, 0] = -torch.inf
-    axes = {"x": np.arange(6.0), "y": np.arange(5.0), "height": 1.2}
-    radio_map = SimpleNamespace(rss_dbm=lambda: rss, best_dbm=lambda: rss.amax(0), **axes)
+    pair = scene.with_transmitters([Radio.at("/A", 1, 1, 1), Radio.at("/B", 2, 1, 1, power_dbm=60)])
+    upright = plane_through((0.0, 2.95, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    flat = map_of(pair, level(), gains(2, 5, 6))
+    steep = map_of(pair, grid_on(upright, (0.0, 0.0, 3.0, 2.0), 0.5), gains(2, 4, 6))
+    single = map_of(scene, grid_on(Pose.at(0, 0, 1), (0, 0, 1, 1), 1.0), gains(1, 1, 1))
+    patches = patches_of(World(scene), "/World/Wall", 1.0, 0.01)
+    surface = map_of(pair, patches, gains(2, len(patches.point)))
     measured = np.linspace(-90.0, -40.0, 50)
     figures = {
         "run": plot.scene_figure(scene, small_run.paths, small_run.channel),
@@ -78,14 +99,46 @@ def test_figures_are_saved_as_pictures(small_run, tmp_path):
         "empty": plot.scene_figure(Scene()),
         "delay": plot.delay_figure(scene, small_run.channel, [(0, 0), (0, 1)]),
         "silence": plot.delay_figure(scene, small_run.channel, []),
-        "map": plot.map_figure(radio_map, scene),
-        "second": plot.map_figure(radio_map, scene, 1),
+        "map": plot.map_figure(flat, pair),
+        "second": plot.map_figure(flat, pair, 1),
+        "upright": plot.map_figure(steep, pair),
+        "nothing": plot.map_figure(single, scene),
         "compared": plot.comparison_figure(measured, {"rfsg": measured + 1.0}),
     }
+    for metric, shown in (("sinr", flat), ("best-server", flat), ("path-loss", surface)):
+        figures[metric] = plot.map_figure(shown, pair, metric=metric)
     for name, figure in figures.items():
         file = plot.save(figure, tmp_path / f"{name}.png", dpi=40)
         assert file.read_bytes().startswith(b"\x89PNG")
     assert len(list(tmp_path.iterdir())) == len(figures)
+    with pytest.raises(ValueError, match="best-server"):
+        plot.map_figure(flat, pair, metric="colour")
+
+
+def test_a_map_shows_the_best_in_each_cell_and_nothing_where_nothing_arrives():
+    scene = Scene(transmitters=(Radio.at("/A", 1, 1, 1), Radio.at("/B", 2, 1, 1, power_dbm=3.0)))
+    gain = torch.tensor([[[1e-6, 0.0, 1e-8]], [[1e-8, 0.0, 1e-8]]], dtype=torch.float64)
+    found = map_of(scene, grid_on(Pose.identity(), (0, 0, 3, 1), 1.0), gain)
+
+    def shown(metric, transmitter=None):
+        return plot.metric_values(found, transmitter, metric, 20e6, 0.0)[0].filled(-999).tolist()[0]
+
+    assert shown("rss") == pytest.approx([-60.0, -999.0, -77.0])
+    assert shown("rss", 1) == pytest.approx([-77.0, -999.0, -77.0])
+    assert shown("path-loss") == pytest.approx([60.0, -999.0, 80.0])
+    assert shown("best-server") == [0, -999, 1]
+    sinr = found.sinr_db(20e6)
+    assert shown("sinr")[0] == pytest.approx(float(sinr[0, 0, 0]))
+    assert shown("sinr", 1)[0] == pytest.approx(float(sinr[1, 0, 0]))
+
+
+def test_an_upright_plane_cuts_a_sphere_in_its_circle():
+    """0.3 m from the middle of a ball of 0.5 m: a circle of 0.4 m."""
+    plane = plane_through((0.0, 0.3, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    ball = node(Sphere(0.5), Pose.at(1.0, 0.0, 2.0))
+    (ring,) = plot.cut(ball, plane, (0.0, 2.0), (1.0, 3.0))
+    assert np.hypot(ring[:, 0] - 1.0, ring[:, 1] - 2.0) == pytest.approx(0.4, abs=0.005)
+    assert plot.cut(node(Sphere(0.2), Pose.at(1.0, 0.0, 2.0)), plane, (0.0, 2.0), (1.0, 3.0)) == []
 
 
 def test_the_delay_profile_shows_each_arriving_path_once(small_run):

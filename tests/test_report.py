@@ -6,9 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from rfsg import report
-from rfsg.tracer.channel import Link
+from rfsg.scene.world import World
+from rfsg.tracer.cells import grid_on, plane_through
+from rfsg.tracer.channel import Link, thermal_noise_dbm
+from rfsg.tracer.patches import patches_of
+from rfsg.tracer.radiomap import RadioMap
 from rfsg.tracer.records import Act
 
 SPEED_OF_LIGHT = 299_792_458.0
@@ -100,6 +105,55 @@ def test_the_channel_file_holds_the_same_bits(small_run, tmp_path):
         gains = 0.0239 / lengths * np.exp(1j * np.array([0.0, 3.0]))
         expected = (gains * np.exp(-2j * np.pi * 1e9 * lengths / SPEED_OF_LIGHT)).sum()
         assert h == pytest.approx(expected, rel=1e-9)
+
+
+def test_responses_are_the_channel_over_band_and_time(small_run, tmp_path):
+    channel = small_run.channel
+    arrays = report.response_arrays(small_run, 1e8, 8, snapshots=5, duration_s=1e-3)
+    report.write_channel(small_run, tmp_path / "channel.npz", arrays)
+    with np.load(tmp_path / "channel.npz", allow_pickle=False) as stored:
+        assert stored["time"] == pytest.approx(np.arange(5) * 2e-4)
+        assert stored["subcarrier_frequency"].shape == (1, 8)
+        assert stored["cfr"].shape == (1, 2, 1, 5, 8) and stored["transfer"].shape == (1, 2, 1, 5)
+        # the carrier is number 4 of 8, at every time
+        assert stored["cfr"][..., 4] == pytest.approx(stored["transfer"])
+        delay, drift = channel.delay[:2, None].numpy(), channel.doppler[:2, None].numpy() / 1e9
+        late = delay - drift * stored["time"]
+        gain = channel.gain[:2].numpy() * np.exp(-2j * np.pi * 1e9 * late)
+        assert stored["transfer"][0, 0, 0] == pytest.approx(gain.sum(0), rel=1e-6)
+        count, first = stored["taps"].shape[-1], int(stored["first_tap"])
+        number = first + np.arange(count)
+        pulse = np.sinc(number - 1e8 * delay)
+        taps = (gain[:, :1] * pulse).sum(0)
+        assert stored["taps"][0, 0, 0, 0] == pytest.approx(taps, rel=1e-6, abs=1e-9)
+    assert report.response_arrays(small_run) == {}
+    with pytest.raises(ValueError, match="snapshots"):
+        report.response_arrays(small_run, snapshots=5)
+
+
+def test_a_map_file_places_its_cells_and_holds_every_metric(small_run, tmp_path):
+    scene = small_run.scene
+    upright = plane_through((1.0, 2.0, 0.5), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    gain = torch.tensor([[[1e-6, 0.0]]], dtype=torch.float64)
+    found = RadioMap(scene, 1e9, grid_on(upright, (0, 0, 2, 1), 1.0), gain, 0 * gain, "paths")
+    report.write_map(found, tmp_path / "map.npz", 1e6, 5.0)
+    with np.load(tmp_path / "map.npz", allow_pickle=False) as stored:
+        x, y = (stored[name][..., None] for name in "xy")
+        place = stored["origin"] + x * stored["u"] + y[:, None] * stored["v"]
+        assert place.reshape(-1, 3) == pytest.approx(found.cells.point.numpy())
+        assert stored["rss_dbm"].tolist() == [[[pytest.approx(-50.0), -np.inf]]]
+        assert stored["path_loss_db"].tolist() == [[[pytest.approx(60.0), np.inf]]]
+        noise = thermal_noise_dbm(1e6, 5.0)
+        assert stored["sinr_db"][0, 0, 0] == pytest.approx(-50.0 - noise)
+        assert stored["best_server"].tolist() == [[0, -1]]
+        assert not np.isnan(stored["sinr_db"]).any()
+    patches = patches_of(World(scene), "/World/Ball", 1.0, 0.01)
+    gain = torch.ones(1, len(patches.point), dtype=torch.float64)
+    on = RadioMap(scene, 1e9, patches, gain, 0 * gain, "paths")
+    report.write_map(on, tmp_path / "on.npz")
+    with np.load(tmp_path / "on.npz", allow_pickle=False) as stored:
+        assert stored["triangle"].shape == (len(patches.point), 3, 3)
+        assert stored["area"] == pytest.approx(patches.area.numpy())
 
 
 def test_the_report_is_json_and_complete(small_run, tmp_path):

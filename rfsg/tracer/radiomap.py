@@ -1,59 +1,102 @@
-"""Radio maps: power over the cells of a horizontal plane.
+"""Radio maps: power over the cells of a plane of any orientation, or of a surface.
 
-``rays`` (default): the Monte Carlo estimator of ``montecarlo``, every branch followed: what crosses a
-cell, over its area. ``paths``: the exact path solver at the cell centres. The rays' map is the mean
-over a cell, the solver's a point of it, so the reported error holds both the scatter between turned
-lattices and the spread of power within the cell.
+``rays``: the Monte Carlo estimator of ``montecarlo``, every branch followed: what crosses a cell,
+over its area. It follows reflection and penetration. ``paths``: the exact path solver at the cells'
+middles, with all that the quality asks for. The rays' map is the mean over a cell, the solver's a
+point of it, so the reported error holds both the scatter between turned lattices and the spread of
+power within the cell.
+
+Power is summed over paths without phase, as it is where phases average out over a cell.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
+from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
-from rfsg.tracer.channel import power
+from rfsg.tracer.cells import Grid, extent, grid_on
+from rfsg.tracer.channel import power, thermal_noise_dbm
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.field import SPEED_OF_LIGHT
-from rfsg.tracer.montecarlo import COPIES, Flight, flights
-from rfsg.tracer.plan import Quality
+from rfsg.tracer.montecarlo import COPIES, flights
+from rfsg.tracer.patches import Patches, patches_from, patches_of
+from rfsg.tracer.plan import Quality, make_plan
 from rfsg.tracer.simulate import positions, resolve_frequency, simulate, world_for
 
-SUB = 4  # sub-cells per side, from which the spread within a cell is read
-MOST_CELLS = (
-    4_000_000  # a map larger than this is a mistyped cell size: refuse before taking memory
-)
+RECEIVERS_AT_ONCE = 4096  # of a map by paths: memory stays bounded, and the answer the same
 
 
 @dataclass(frozen=True)
 class RadioMap:
-    """Power over a plane. x, y: cell centres [m]; path_gain: linear, incoherent, strongest first by
-    transmitter; 0 where nothing arrives. error_db: one standard deviation [dB], inf where nothing
-    arrives, 0 for the path solver."""
+    """Power over cells, by transmitter in scene order; ``*c`` is [ny nx] on a plane, [c] on a surface.
+
+    path_gain: linear, from the transmitter's antenna to an isotropic one, 0 where nothing arrives.
+    error_db: one standard deviation [dB], inf where nothing arrives, 0 for the path solver.
+    """
 
     scene: Scene
     frequency: float
-    height: float
-    cell: float
-    x: Float[Tensor, "nx"]
-    y: Float[Tensor, "ny"]
-    path_gain: Float[Tensor, "t ny nx"]
-    error_db: Float[Tensor, "t ny nx"]
+    cells: Grid | Patches
+    path_gain: Float[Tensor, "t *c"]
+    error_db: Float[Tensor, "t *c"]
     method: str
+    modelled: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
-    def rss_dbm(self) -> Float[Tensor, "t ny nx"]:
-        """Received signal strength per transmitter [dBm]; -inf where nothing arrives."""
-        sent = [r.power_dbm for r in self.scene.transmitters]
-        level = torch.tensor(sent, dtype=torch.float64).reshape(-1, 1, 1)
-        return level + 10.0 * torch.log10(self.path_gain.cpu())
+    def path_loss_db(self) -> Float[Tensor, "t *c"]:
+        """-10 log10 of the path gain, the transmitter's pattern included; inf where nothing arrives."""
+        return -10.0 * torch.log10(self.path_gain.cpu())
 
-    def best_dbm(self) -> Float[Tensor, "ny nx"]:
-        """Strongest transmitter's signal in each cell [dBm]."""
-        return self.rss_dbm().amax(0)
+    def rss_dbm(self) -> Float[Tensor, "t *c"]:
+        """Received signal strength of each transmitter [dBm]; -inf where nothing arrives."""
+        sent = torch.tensor([r.power_dbm for r in self.scene.transmitters], dtype=torch.float64)
+        return sent.reshape(-1, *[1] * len(self.cells.shape)) - self.path_loss_db()
+
+    def best_dbm(self) -> Float[Tensor, "*c"]:
+        """Strongest transmitter's signal in each cell [dBm]; -inf where there is none."""
+        silence = torch.full((1, *self.cells.shape), -torch.inf, dtype=torch.float64)
+        return torch.cat([silence, self.rss_dbm()]).amax(0)
+
+    def best_server(self) -> Int[Tensor, "*c"]:
+        """Number of the strongest transmitter in each cell, the first of equals; -1 for none."""
+        if not len(self.path_gain):
+            return torch.full(self.cells.shape, -1, dtype=torch.int64)
+        best = self.rss_dbm().argmax(0)
+        return torch.where(self.best_dbm() > -torch.inf, best, torch.full_like(best, -1))
+
+    def snr_db(
+        self, bandwidth_hz: float, noise_figure_db: float = 0.0, temperature_k: float = 290.0
+    ) -> Float[Tensor, "t *c"]:
+        """Signal of each transmitter over thermal noise k T B F [dB]. ValueError as for the noise."""
+        return self.rss_dbm() - thermal_noise_dbm(bandwidth_hz, noise_figure_db, temperature_k)
+
+    def sinr_db(
+        self, bandwidth_hz: float, noise_figure_db: float = 0.0, temperature_k: float = 290.0
+    ) -> Float[Tensor, "t *c"]:
+        """Signal of each transmitter over noise and all other transmitters together [dB].
+
+        All transmit in the one band, all the time. ValueError as for the noise.
+        """
+        noise = 10.0 ** (
+            thermal_noise_dbm(bandwidth_hz, noise_figure_db, temperature_k) / 10.0
+        )  # [mW]
+        signal = 10.0 ** (self.rss_dbm() / 10.0)
+        # summed without the own signal, not subtracted: a strong one would take the others' digits
+        others = 1.0 - torch.eye(len(signal), dtype=torch.float64)
+        return 10.0 * torch.log10(signal / (noise + torch.tensordot(others, signal, dims=1)))
+
+    def coverage(self, threshold_dbm: float) -> float:
+        """Share of the area in which the best server reaches a signal strength [dBm]."""
+        area = self.cells.area.cpu().reshape(self.cells.shape)
+        return float(area[self.best_dbm() >= threshold_dbm].sum() / area.sum())
 
 
 @torch.no_grad()
@@ -64,131 +107,160 @@ def radio_map(
     height: float = 1.2,
     cell: float = 0.5,
     bounds: tuple[float, float, float, float] | None = None,
+    plane: Pose | None = None,
     quality: str | Quality = "standard",
     method: str = "rays",
     seed: int = 0,
     device: torch.device | str = "cpu",
 ) -> RadioMap:
-    """Path gain of every transmitter over cells of ``cell`` [m] at ``height`` [m].
+    """Path gain of every transmitter over square cells of side ``cell`` [m] on a plane.
 
-    bounds: (x0, y0, x1, y1) [m]; None takes the objects' and radios' extent. Raises SceneError for
-    a map of no or of too many cells, and for an unknown method.
+    plane: a pose whose x and y axes span it (``cells.plane_through``); None is level, at ``height``
+    [m]. bounds: (x0, y0, x1, y1) [m] in the plane's frame, for a level one the world's; None takes
+    the extent of objects and radios. Raises SceneError for a map of no or of too many cells, and for
+    an unknown method.
     """
+    question = _question(scene, frequency, quality, method, seed, device)
+    plane = Pose.at(0.0, 0.0, height) if plane is None else plane
+    bounds = bounds or extent(scene, _corners(question.world), plane)
+    return question.answer(grid_on(plane, bounds, cell))
+
+
+@torch.no_grad()
+def radio_map_on(
+    scene: Scene,
+    where: str | tuple[Any, Any],
+    frequency: float | None = None,
+    *,
+    cell: float = 0.25,
+    offset: float = 0.01,
+    quality: str | Quality = "standard",
+    method: str = "paths",
+    seed: int = 0,
+    device: torch.device | str = "cpu",
+) -> RadioMap:
+    """Path gain over the outside of a surface, in triangles no longer than ``cell`` [m].
+
+    where: the prim path of an object, or a mesh (vertices [v 3] m in the world, faces [k 3]), which
+    waves do not see. offset: how far before the surface the field is taken [m], as an antenna
+    mounted there would; what the surface itself reflects is part of it. Raises SceneError for an
+    object that is not there or has no bounded surface, and for a mesh that is not one.
+    """
+    question = _question(scene, frequency, quality, method, seed, device)
+    if isinstance(where, str):
+        return question.answer(patches_of(question.world, where, cell, offset))
+    return question.answer(patches_from(*where, cell, offset))
+
+
+@dataclass(frozen=True)
+class _Question:
+    """What every map is asked with."""
+
+    world: World
+    frequency: Float[Tensor, "1"]
+    quality: Quality
+    method: str
+    seed: int
+
+    def answer(self, cells: Grid | Patches) -> RadioMap:
+        make = _by_rays if self.method == "rays" else _by_paths
+        return make(self, cells)
+
+
+def _question(
+    scene: Scene,
+    frequency: float | None,
+    quality: str | Quality,
+    method: str,
+    seed: int,
+    device: torch.device | str,
+) -> _Question:
     if method not in ("rays", "paths"):
         raise SceneError([f"map method {method!r}: expected 'rays' or 'paths'"])
     quality = Quality.named(quality) if isinstance(quality, str) else quality
     f = resolve_frequency(scene, frequency)[:1].to(device)
-    world = world_for(scene, quality, device)
-    x0, y0, x1, y1 = bounds or _extent(world)
-    nx, ny = (max(1, math.ceil(s / cell - 1e-9)) for s in (x1 - x0, y1 - y0))
-    if not (cell > 0 and x1 > x0 and y1 > y0) or nx * ny > MOST_CELLS:
-        raise SceneError(
-            [
-                f"map: {nx} x {ny} cells of {cell} m over {(x0, y0, x1, y1)}: expected 1 to {MOST_CELLS}"
-            ]
-        )
-    x = x0 + cell * (torch.arange(nx, dtype=torch.float64) + 0.5)
-    y = y0 + cell * (torch.arange(ny, dtype=torch.float64) + 0.5)
-    make = _by_rays if method == "rays" else _by_paths
-    gain, error = make(scene, world, f, quality, height, cell, x, y, seed)
-    return RadioMap(scene, float(f[0]), height, cell, x, y, gain, error, method)
+    return _Question(world_for(scene, quality, device), f, quality, method, seed)
 
 
-def _extent(world: World) -> tuple[float, float, float, float]:
+def _corners(world: World) -> Float[Tensor, "k 3"]:
+    """Corners of all bounded objects [m]."""
     bounded = torch.isfinite(world.bounds_object).all(-1).all(-1)
-    which = torch.nonzero(bounded).squeeze(-1)
-    points = [Proxies(world).corners(which).reshape(-1, 3)]
-    radios = (*world.scene.transmitters, *world.scene.receivers)
-    points.append(positions(radios, world.device))
-    every = torch.cat(points)
-    if not len(every):
-        raise SceneError(
-            ["map: the scene is empty, so it has no extent; give bounds=(x0, y0, x1, y1)"]
+    return Proxies(world).corners(torch.nonzero(bounded).squeeze(-1)).reshape(-1, 3)
+
+
+def _by_paths(question: _Question, cells: Grid | Patches) -> RadioMap:
+    scene, world = question.world.scene, question.world
+    eye, still = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    gains, warnings = [], {}
+    modelled, left_out = {}, {}  # dictionaries as ordered sets
+    for places in cells.point.split(RECEIVERS_AT_ONCE):
+        some = [Radio(f"cell{k}", p, eye, still) for k, p in enumerate(places)]
+        result = simulate(
+            scene.with_receivers(some), question.frequency, question.quality, device=world.device
         )
-    low, high = every.amin(0), every.amax(0)
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+        gains.append(power(result.channel, len(scene.transmitters), len(some))[..., 0])
+        warnings |= dict.fromkeys(result.warnings)
+        modelled |= dict.fromkeys(result.plan.modelled)
+        left_out |= dict.fromkeys(result.plan.left_out)
+    gain = torch.cat(gains, -1).reshape(-1, *cells.shape)
+    return RadioMap(
+        scene,
+        float(question.frequency[0]),
+        cells,
+        gain,
+        torch.zeros_like(gain),
+        "paths",
+        tuple(modelled),
+        tuple(left_out),
+        tuple(warnings),
+    )
 
 
-def _by_paths(
-    scene: Scene,
-    world: World,
-    f: Tensor,
-    quality: Quality,
-    height: float,
-    cell: float,
-    x: Tensor,
-    y: Tensor,
-    seed: int,
-) -> tuple[Tensor, Tensor]:
-    eye, zero = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    gy, gx = torch.meshgrid(y, x, indexing="ij")
-    place = torch.stack([gx, gy, torch.full_like(gx, height)], -1).reshape(-1, 3)
-    cells = [Radio(f"cell{k}", p, eye, zero) for k, p in enumerate(place)]
-    result = simulate(scene.with_receivers(cells), f, quality, device=world.device)
-    gain = power(result.channel, len(scene.transmitters), len(cells))[..., 0]
-    gain = gain.reshape(-1, len(y), len(x))
-    return gain, torch.zeros_like(gain)
-
-
-def _by_rays(
-    scene: Scene,
-    world: World,
-    f: Tensor,
-    quality: Quality,
-    height: float,
-    cell: float,
-    x: Tensor,
-    y: Tensor,
-    seed: int,
-) -> tuple[Tensor, Tensor]:
-    proxies = Proxies(world)
+def _by_rays(question: _Question, cells: Grid | Patches) -> RadioMap:
+    world, quality, f = question.world, question.quality, question.frequency
+    scene, proxies = world.scene, Proxies(world)
     tx = positions(scene.transmitters, world.device)
-    fine = cell / SUB
-    corner = (float(x[0]) - 0.5 * cell, float(y[0]) - 0.5 * cell)
-    shape = (len(y) * SUB, len(x) * SUB)
-    aperture = float((SPEED_OF_LIGHT / f) ** 2) / (4 * math.pi) / fine**2
-    gains, errors = [], []
+    fine = (cells.area.to(world.device) / cells.subcells).repeat_interleave(cells.subcells)
+    aperture = float((SPEED_OF_LIGHT / f) ** 2) / (4 * math.pi)
+    gain = torch.zeros(len(tx), len(fine) // cells.subcells, dtype=torch.float64, device=f.device)
+    error = torch.full_like(gain, torch.inf)
     for t, radio in enumerate(scene.transmitters):
-        grid = torch.zeros(COPIES, shape[0] * shape[1], dtype=torch.float64, device=world.device)
-        for copy, flight in flights(world, proxies, radio, tx[t], f, quality, "enumerate", seed):
-            index, share = _deposit(flight, height, corner, fine, shape)
-            grid[copy].index_add_(0, index, share)
-        sub = (grid * aperture).reshape(COPIES, len(y), SUB, len(x), SUB).transpose(2, 3)
-        sub = sub.reshape(COPIES, len(y), len(x), SUB * SUB)
-        gain, error = _summary(sub)
-        gains.append(gain)
-        errors.append(error)
-    blank = torch.zeros(0, len(y), len(x), dtype=torch.float64, device=world.device)
-    return (torch.stack(gains), torch.stack(errors)) if gains else (blank, blank)
+        total = torch.zeros(COPIES, len(fine), dtype=torch.float64, device=world.device)
+        for copy, flight in flights(
+            world, proxies, radio, tx[t], f, quality, "enumerate", question.seed
+        ):
+            met = cells.meet(flight.rays)
+            share = flight.power_at(met.ray, met.distance) / met.cosine
+            total[copy].index_add_(0, met.subcell, share)
+        density = (total * aperture / fine).reshape(COPIES, -1, cells.subcells)
+        gain[t], error[t] = _summary(density)
+    plan = make_plan(world, quality)
+    return RadioMap(
+        scene,
+        float(f[0]),
+        cells,
+        gain.reshape(-1, *cells.shape),
+        error.reshape(-1, *cells.shape),
+        "rays",
+        (f"{quality.map_rays} rays from each transmitter, {quality.depth} reflections at most",),
+        (*plan.left_out, *_NOT_BY_RAYS),
+        scene.warnings,
+    )
 
 
-def _deposit(
-    flight: Flight, height: float, corner: tuple[float, float], fine: float, shape: tuple[int, int]
-) -> tuple[Tensor, Tensor]:
-    """(flat sub-cell, power over |cos|) of rays that cross the plane."""
-    o, d = flight.rays.origin, flight.rays.direction
-    slope = d[:, 2]
-    flat = slope.abs() < GRAZING
-    t = (height - o[:, 2]) / torch.where(flat, torch.ones_like(slope), slope)
-    ray = torch.nonzero(~flat & (t > 0)).squeeze(-1)
-    place = o[ray] + t[ray, None] * d[ray]
-    column = torch.floor((place[:, 0] - corner[0]) / fine)
-    row = torch.floor((place[:, 1] - corner[1]) / fine)
-    hit = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
-    ray, row, column = ray[hit], row[hit].long(), column[hit].long()
-    return row * shape[1] + column, flight.power_at(ray, t[ray]) / slope[ray].abs()
+_NOT_BY_RAYS = (
+    "diffraction, diffuse scattering, bending inside solids and polarisation: a map by rays follows "
+    "straight rays with mirror reflections; a map by paths follows what the quality asks for",
+)
 
 
-GRAZING = 1e-3  # rays flatter than a milliradian cross a map's plane where it no longer matters
-
-
-def _summary(sub: Float[Tensor, "n y x s"]) -> tuple[Tensor, Tensor]:
+def _summary(density: Float[Tensor, "n c s"]) -> tuple[Tensor, Tensor]:
     """Mean gain of cells, and one standard deviation in dB of scatter and spread together."""
-    mean = sub.mean((0, 3))
-    scatter = sub.mean(3).std(0) / COPIES**0.5
+    mean = density.mean((0, 2))
+    scatter = density.mean(2).std(0) / COPIES**0.5
     # the spread between sub-cells, less what their own scatter already explains
-    noise = (sub.var(0) / COPIES).mean(-1)
-    spread = torch.clamp(sub.mean(0).var(-1) - noise, min=0.0)
+    noise = (density.var(0) / COPIES).mean(-1)
+    spread = torch.clamp(density.mean(0).var(-1) - noise, min=0.0)
     deviation = torch.sqrt(scatter**2 + spread)
     safe = torch.where(mean > 0, mean, torch.ones_like(mean))
     error = 10.0 * torch.log10(1.0 + deviation / safe)
