@@ -9,6 +9,9 @@ from rfsg.scene.world import World
 class Quality:
     """How hard to look. Every field may be overridden: ``Quality.named("draft", depth=2)``.
 
+    Fields left alone are those of "standard", but for ``diffraction``, which a Quality made by hand
+    asks for itself.
+
     depth: most reflections on a path.
     curved: most of them on curved or learned faces (each scatters a wave widely; two are weak).
     curved_depth: most reflections in all on a path that has a curved or learned face.
@@ -76,9 +79,10 @@ PRESETS = {
         refits=10,
         map_rays=20_000,
     ),
-    "standard": Quality(),
+    "standard": Quality(diffraction=1),
     "reference": Quality(
         depth=5,
+        diffraction=2,
         curved=2,
         curved_depth=5,
         rays=200_000,
