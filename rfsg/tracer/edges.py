@@ -10,6 +10,7 @@ from torch import Tensor
 from rfsg.objects.shapes.edges import edges_of
 from rfsg.scene.world import World, unit
 
+LEAST = 1.0  # [wavelengths] length of an edge that diffracts
 LOOKS = 9  # places along an edge at which to see whether anything of it is free
 ACROSS = (0.01, 0.25, 0.5, 0.75, 0.99)  # of the exterior angle: where the wedge must be free
 NEARBY = (5e-2, 5e-5)  # wavelengths: what is closer than this to a wedge is part of it
@@ -102,7 +103,8 @@ def along_face(normal0: Tensor, normal1: Tensor) -> Tensor:
 
 
 def edges_in(world: World, wavelength: float) -> Edges:
-    """Every edge of the world that stands free somewhere; differentiable in poses and sizes."""
+    """Every edge of the world that stands free somewhere and is a wavelength long or more: what is
+    shorter sends no wave of its own that UTD knows. Differentiable in poses and sizes."""
     parts = []
     for k, node in enumerate(world.scene.nodes):
         own = edges_of(node.body.shape)
@@ -133,6 +135,7 @@ def edges_in(world: World, wavelength: float) -> Edges:
     if not parts:
         return _none(world)
     every = Edges(*(torch.cat([getattr(p, n) for p in parts]) for n in Edges.__dataclass_fields__))
+    every = every.take(torch.nonzero(every.length >= LEAST * wavelength).squeeze(-1))
     share = (torch.arange(LOOKS, dtype=torch.float64, device=world.device) + 0.5) / LOOKS
     look = every.take(torch.arange(len(every), device=world.device).repeat_interleave(LOOKS))
     free = is_free(world, look, (every.length[:, None] * share).reshape(-1), wavelength)
