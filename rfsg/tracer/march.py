@@ -50,7 +50,9 @@ def crossings(world: World, rays: Rays, spans: Spans, options: MarchOptions = SE
             parts.append(_learned(world, rays, _select(rest, piece), options))
     ray, which, enter, leave = (torch.cat(column) for column in zip(*parts, strict=True))
     aside = torch.cat([aside, aside.new_zeros(len(ray) - len(aside), 3)])
-    order = sort_by(ray, enter)
+    # what only begins or ends on a face does not go through it
+    through = torch.nonzero((leave > TOUCH) & (enter < rays.limit[ray] - TOUCH)).squeeze(-1)
+    order = through[sort_by(ray[through], enter[through])]
     ray, which, enter, leave = ray[order], which[order], enter[order], leave[order]
     normals = _normals(world, rays, ray, which, torch.cat([enter, leave]), aside[order])
     return Crossings(

@@ -62,7 +62,7 @@ _SENTENCES = {
     Status.NOT_CONVERGED: "Newton did not settle on a stationary path within its iterations",
     Status.OFF_SURFACE: "the stationary point lies outside the object's surface (its edge was passed)",
     Status.WRONG_SIDE: "a vertex would be met from behind: no reflection there",
-    Status.DUPLICATE: "the same path was already found from another beginning",
+    Status.DUPLICATE: "the same path was already found, from another beginning or on a face that coincides",
     Status.BELOW_FLOOR: "the path is weaker than the power floor of this quality",
     Status.UNRESOLVED: "the reflecting piece is too small or too rough at the wave's scale to act as a mirror",
     Status.OPAQUE: "an opaque object stands on the path",

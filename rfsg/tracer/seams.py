@@ -1,4 +1,6 @@
-"""Rays that run in the very faces of objects: between two that touch, they are inside.
+"""Faces that touch or coincide: where two objects would both count, or neither, one does.
+
+A mirror of flush pieces reflects once where their seam lies, and one drawn twice as well.
 
 A line in a face is outside its object: an antenna on a ceiling sees along it. But where two walls
 stand flush, their seam is the inside of what they make together, and a ray along it would slip through
@@ -7,11 +9,11 @@ a hair to either side: where both are inside something, so is the ray between th
 """
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.scene.world import FLUSH, World, unit
-from rfsg.tracer.records import Rays, Spans
+from rfsg.tracer.records import Chains, Rays, Spans
 
 # no face of a drawing holds this direction
 ASIDE = (1.0, 0.7548776662466927, 0.5698402909980532)
@@ -30,7 +32,7 @@ def along_seams(world: World, rays: Rays, spans: Spans) -> tuple[Spans, Float[Te
     i, j = _pairs(a.ray, b.ray)
     met = torch.minimum(a.leave[i], b.leave[j]) - torch.maximum(a.enter[i], b.enter[j]) > FLUSH
     i, j = i[met], j[met]
-    name = torch.tensor(_order([n.path for n in world.scene.nodes]), device=i.device)
+    name = _order(world)
     longer = (a.leave - a.enter)[i] - (b.leave - b.enter)[j]
     first = torch.where(longer.abs() <= FLUSH, name[a.which[i]] < name[b.which[j]], longer < 0)
     both = torch.unique(torch.cat([i[first], len(a.ray) + j[~first]]))
@@ -58,9 +60,47 @@ def _pairs(a: Int[Tensor, "n"], b: Int[Tensor, "m"]) -> tuple[Int[Tensor, "k"], 
     return i, first[i] + rank
 
 
-def _order(names: list[str]) -> list[int]:
-    """The place of each name among all of them in order: what it is does not depend on the list's."""
-    place = [0] * len(names)
-    for k, i in enumerate(sorted(range(len(names)), key=lambda i: names[i])):
-        place[i] = k
+@torch.no_grad()
+def coincident(
+    world: World,
+    chains: Chains,
+    vertices: Float[Tensor, "c k 3"],
+    normal: Float[Tensor, "c d 3"],
+    good: Bool[Tensor, "c"],
+) -> Bool[Tensor, "c"]:
+    """Reflections at the same points of faces that look the same way, on other objects: of the good
+    paths all but the one whose objects stand first by name."""
+    i = torch.nonzero(good).squeeze(-1)
+    place = torch.round(vertices[i].flatten(1) / SAME).to(torch.int64)
+    turn = torch.round(normal[i].flatten(1) / TURNED).to(torch.int64)
+    key = torch.cat([chains.tx[i, None], chains.rx[i, None], place, turn], 1)
+    # one number for a row: integers wrap around, and two rows share one by a chance of 1 in 1e19
+    odd = (2 * torch.arange(key.shape[1], device=i.device) + 1) * 0x1E3779B97F4A7C15
+    _, group, count = torch.unique((key * odd).sum(1), return_inverse=True, return_counts=True)
+    several = count[group] > 1
+    i, group = i[several], group[several]
+    out = torch.zeros_like(good)
+    if len(i):
+        name = torch.cat([_order(world), torch.full_like(i[:1], -1)])  # the last is the padding's
+        order = torch.arange(len(i), device=i.device)
+        for column in (*name[chains.which[i]].unbind(1)[::-1], group):
+            order = order[torch.argsort(column[order], stable=True)]
+        first = torch.ones_like(several[: len(i)])
+        first[1:] = group[order][1:] != group[order][:-1]
+        out[i[order[~first]]] = True
+    return out
+
+
+SAME = 1e-7  # [m] vertices nearer than this
+TURNED = 1e-3  # [rad] and normals
+
+
+def _order(world: World) -> Int[Tensor, "n"]:
+    """The place of each node's name among all: what it is does not depend on the scene's order."""
+    names = [n.path for n in world.scene.nodes]
+    sorted_by_name = sorted(range(len(names)), key=lambda i: names[i])
+    place = torch.zeros(len(names), dtype=torch.int64, device=world.device)
+    place[torch.tensor(sorted_by_name, dtype=torch.int64, device=world.device)] = torch.arange(
+        len(names), device=world.device
+    )
     return place

@@ -31,10 +31,12 @@ from rfsg.tracer.march import FORWARD
 from rfsg.tracer.newton import Batch, Surfaces, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains, Paths, Status
+from rfsg.tracer.seams import coincident
 from rfsg.tracer.settle import Charts, settle, tolerance
 from rfsg.tracer.zone import Facets
 
 RIM = 1e-6  # of an object's size: the step that tells a rim from a bend
+COINCIDENT = 1e-9  # [m] vertices nearer to each other than this define no direction
 GRAZING = 1e-9  # cosine below which a path runs along a face and is not reflected by it
 
 
@@ -98,7 +100,7 @@ def _one_way(world: World, batch: Batch, wavelength: float, quality: Quality) ->
 def _solve_depth(world: World, batch: Batch, wavelength: float, quality: Quality) -> Solved:
     c, depth = batch.which.shape
     if depth == 0:
-        return _direct(batch, wavelength)
+        return _direct(batch)
     flat_which, flat_patch = batch.which.reshape(-1), batch.patch.reshape(-1)
     planar = world.plane(flat_which, flat_patch)[2].reshape(c, depth)
     mirrors = planar.all(1)
@@ -130,21 +132,13 @@ def _merge(c: int, jobs: list[tuple[Tensor, Callable[[Batch], Solved]]], batch: 
     )
 
 
-def _direct(batch: Batch, wavelength: float) -> Solved:
+def _direct(batch: Batch) -> Solved:
     vertices = batch.polyline()
     length, _ = segments(vertices)
-    good = length[:, 0] > 0
-    spread, capped = _capped_inverse(length[:, 0], wavelength)
-    status = torch.where(capped, int(Status.CAUSTIC_CAPPED), int(Status.OK))
-    status = torch.where(good, status, int(Status.DEGENERATE))
+    apart = length[:, 0] > COINCIDENT
+    status = torch.where(apart, int(Status.OK), int(Status.DEGENERATE))
+    spread = 1.0 / torch.where(apart, length[:, 0], 1.0)
     return Solved(vertices, batch.x, spread, torch.zeros_like(status), status)
-
-
-def _capped_inverse(length: Tensor, wavelength: float) -> tuple[Tensor, Tensor]:
-    """1/length, held at 1/wavelength only where the antennas coincide (see ``spreading``)."""
-    zero = length <= 0
-    safe = torch.where(zero, torch.full_like(length, wavelength), length)
-    return 1.0 / safe, zero
 
 
 # planar mirrors: the image method
@@ -282,7 +276,7 @@ def _validate(
             status[~resolved.reshape(c, depth).all(1)] = int(Status.UNRESOLVED)
         status[~front.all(1)] = int(Status.WRONG_SIDE)
         status[~on.all(1)] = int(Status.OFF_SURFACE)
-        status[~(length > 0).all(1) | ~finite] = int(Status.DEGENERATE)
+        status[~(length > COINCIDENT).all(1) | ~finite] = int(Status.DEGENERATE)
         return status
 
 
@@ -300,11 +294,12 @@ def on_faces(
     x = torch.where(torch.isfinite(x), x, torch.zeros_like(x))
     f = world.sdf(which, x).abs().reshape(c, depth)
     exact = world.exact[which]
-    # a planar face is itself alone; a curved surface may be sought from another of its pieces
+    # a planar face is itself alone, its edges included: on a convex shape whatever lies on its plane
+    # and on the surface is of it. A curved surface may be sought from another of its pieces
     patch = world.patch(which, x)
     planar = world.plane(which, batch.patch.reshape(-1))[2]
     curved = ~planar & ~world.plane(which, patch)[2]
-    same = (patch == batch.patch.reshape(-1)) | curved
+    same = (patch == batch.patch.reshape(-1)) | curved | (planar & world.convex[which])
     rim = torch.zeros_like(exact)
     i = torch.nonzero(exact & curved).squeeze(-1)
     rim[i] = _on_a_rim(world, which[i], x[i], normal.reshape(-1, 3)[i])
@@ -404,9 +399,12 @@ def _gather(
     whole = Solved(
         *(torch.cat([getattr(s, n) for _, s in parts])[order] for n in Solved.__dataclass_fields__)
     )
+    good = (whole.status == int(Status.OK)) | (whole.status == int(Status.CAUSTIC_CAPPED))
+    twin = coincident(world, chains, whole.vertices, whole.normal, good)
+    whole.status[twin] = int(Status.DUPLICATE)
+    good &= ~twin
     numbers = torch.bincount(whole.status, minlength=len(Status)).tolist()
     counts = {s: numbers[s] for s in Status if numbers[s]}
-    good = (whole.status == int(Status.OK)) | (whole.status == int(Status.CAUSTIC_CAPPED))
     keep = torch.nonzero(good | keep_failed).squeeze(-1)
     vertices = whole.vertices[keep]
     return (

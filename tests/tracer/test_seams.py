@@ -98,3 +98,54 @@ def test_gradients_along_a_seam_are_those_of_the_whole_wall():
         power = simulate(scene, 2.4e9, DIRECT, gradients=True).path_gain().sum()
         found.append(torch.autograd.grad(power, at)[0])
     torch.testing.assert_close(found[1], found[0], rtol=1e-6, atol=1e-18)
+
+
+FLOOR = Quality(depth=1, floor_db=-300.0)
+
+
+def floor(parts, surface=None, order=1) -> Result:
+    """A path that bounces at the origin, on a floor of boxes whose tops lie at z = 0."""
+    nodes = [
+        box_node(f"/{k}", (*c, -0.1), (*h, 0.1), surface) for k, (c, h) in enumerate(parts[::order])
+    ]
+    ends = (radio("/t", -2.0, 0.0, 2.0),), (radio("/r", 2.0, 0.0, 2.0),)
+    return simulate(Scene(tuple(nodes), *ends), 2.4e9, FLOOR)
+
+
+TILES = [((x, y), (1.5, 1.5)) for x in (-1.5, 1.5) for y in (-1.5, 1.5)]
+
+
+@pytest.mark.parametrize("surface", [None, Conductor()], ids=["slab", "conductor"])
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        [((-1.5, 0.0), (1.5, 3.0)), ((1.5, 0.0), (1.5, 3.0))],
+        TILES,
+        [((0.0, 0.0), (3.0, 3.0))] * 2,
+        [((0.0, 0.0), (3.0, 3.0)), ((-1.5, 0.0), (1.5, 3.0))],
+    ],
+    ids=["at a seam", "where four tiles meet", "drawn twice", "drawn twice in part"],
+)
+def test_a_floor_in_pieces_reflects_once(parts, order, surface):
+    whole = floor([((0.0, 0.0), (3.0, 3.0))], surface)
+    found = floor(parts, surface, order)
+    assert len(found.paths.tx) == len(whole.paths.tx) == 2
+    assert found.status_counts["DUPLICATE"] == len(parts) - 1
+    torch.testing.assert_close(found.transfer(), whole.transfer(), rtol=1e-9, atol=0.0)
+
+
+def test_an_edge_belongs_to_its_face():
+    """Whichever way rounding goes: the same box at many yaws, the bounce on its very edge."""
+    for yaw in (0.0, 13.0, 57.0, 90.0, 211.0):
+        outer = Pose.at(0.3, -0.2, 0.1, yaw)
+        node = turned(box_node("/half", (-1.5, 0.0, -0.1), (1.5, 3.0, 0.1)), outer)
+        tx, rx = (outer.point_world(vector(x, 0.0, 2.0)).tolist() for x in (-2.0, 2.0))
+        scene = Scene((node,), (radio("/t", *tx),), (radio("/r", *rx),))
+        assert simulate(scene, 2.4e9, FLOOR).status_counts == {"OK": 2}
+
+
+def test_radios_nearer_than_a_nanometre_coincide():
+    for gap, status in ((1e-8, "OK"), (1e-10, "DEGENERATE"), (1e-130, "DEGENERATE")):
+        found = run([], (0.0, 0.0, 0.0), (gap, 0.0, 0.0))
+        assert found.status_counts == {status: 1}
