@@ -487,11 +487,8 @@ Weights = tuple[Tensor, Tensor, Tensor]  # R of face 0, R of face n, T: each [m 
 
 
 def _weights(at: Acting, which: Tensor, w: _Wedge, polarised: bool) -> Weights:
-    """What both faces reflect, and what the direct ray keeps through the wedge, in the edge's frame.
-
-    Unpolarised, each is the link's scalar coefficient times the unit matrix: only then do diffracted,
-    direct and reflected scalar waves add up to a field without steps.
-    """
+    """What both faces reflect, and what the direct ray keeps through the wedge, in the edge's frame;
+    not polarised, each is the link's scalar coefficient times the unit matrix."""
     ahead = unit(w.u_in + w.u_out)
     reflected = []
     for normal in (w.normal0, w.normal1):
@@ -580,13 +577,14 @@ def _arguments(at: Acting, w: _Wedge, back: bool = False) -> tuple[Tensor, ...]:
 
 def _acts(
     at: Acting, i: Tensor, level: int, polarised: bool
-) -> tuple[_Wedge, Complex[Tensor, "m f 2 2"]]:
-    """W [sqrt(m)] of edges at a level. Of two edges of one object, the second answers for both."""
+) -> tuple[_Wedge, Complex[Tensor, "m f 2 2"], Float[Tensor, "m f"]]:
+    """W [sqrt(m)] of edges at a level, and how clear they are of shadow boundaries. Of two edges of one
+    object, the second answers for both."""
     before, after = _diffracts(at, i, level - 1), _diffracts(at, i, level + 1)
     w = _wedge(at, i, level, ~(before | after))
     which = at.paths.which[i, level]
     weights = _weights(at, which, w, polarised)
-    own = _summed(utd.wedge_terms(*_arguments(at, w)), weights)
+    own, clear = _summed(utd.wedge_terms(*_arguments(at, w)), weights), _clear(at, w)
     if level + 1 < at.paths.which.shape[1]:
         first = after & (at.paths.which[i, level + 1] == which)
         eye = torch.eye(2, dtype=own.dtype, device=own.device)
@@ -594,9 +592,14 @@ def _acts(
     j = torch.nonzero(before & (at.paths.which[i, max(level - 1, 0)] == which)).squeeze(-1)
     if len(j):
         those = (weights[0][j], weights[1][j], weights[2][j])
-        pair = _pair(at, i[j], level, w.take(j), own[j], those, polarised)
+        pair, clear_first = _pair(at, i[j], level, w.take(j), own[j], those, polarised)
         own = own.index_copy(0, j, pair)
-    return w, own
+        clear = clear.index_copy(0, j, clear[j] * clear_first)
+    return w, own, clear
+
+
+def _clear(at: Acting, w: _Wedge) -> Float[Tensor, "m f"]:
+    return utd.clearance(*_arguments(at, w))
 
 
 def _diffracts(at: Acting, i: Tensor, level: int) -> Bool[Tensor, "m"]:
@@ -613,7 +616,7 @@ def _pair(
     w2: Tensor,
     weights2: Weights,
     polarised: bool,
-) -> Complex[Tensor, "m f 2 2"]:
+) -> tuple[Complex[Tensor, "m f 2 2"], Float[Tensor, "m f"]]:
     """Two edges of one face: W_2 W_1 / 2 and the slopes' share (utd.along_face, with matrices)."""
     first = _wedge(at, i, level - 1, torch.zeros_like(i, dtype=torch.bool))
     weights1 = _weights(at, at.paths.which[i, level - 1], first, polarised)
@@ -629,7 +632,7 @@ def _pair(
     k = 2.0 * math.pi * at.frequency[None] / SPEED_OF_LIGHT
     reach = (first.s_out * torch.sin(first.beta) * torch.sin(second.beta))[:, None] * k
     slopes = -1j * (sign[:, None] / reach)[..., None, None] * (slope2 @ slope1)
-    return 0.5 * (w2 @ w1 + slopes)
+    return 0.5 * (w2 @ w1 + slopes), _clear(at, first)
 
 
 def _from_face(w: _Wedge, phi: Tensor) -> Tensor:
@@ -639,13 +642,28 @@ def _from_face(w: _Wedge, phi: Tensor) -> Tensor:
 
 
 def coefficient(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f"]:
-    """Of an unpolarised link: with the scalar coefficients of the faces; on metal the soft wave's."""
-    return _acts(at, i, level, False)[1][..., 0, 0]
+    """Of an unpolarised link: near a shadow boundary the scalar wave's, elsewhere the mean power's.
+
+    A diffracted scalar wave must take away exactly the step that direct or reflected scalar waves
+    leave behind, and only the link's own scalar coefficients do that. On metal that is the soft wave,
+    which dies along faces: deep in a shadow it is the hard one that a link lives by. There, as for
+    mirrors, the mean power of the two polarisations counts. ``utd.clearance`` goes from one to the
+    other without step or kink.
+    """
+    _, plain, clear = _acts(at, i, level, False)
+    _, full, _ = _acts(at, i, level, True)
+    mean = 0.5 * (full[..., 0, 0] + full[..., 1, 1])
+    size = torch.sqrt(mean.real**2 + mean.imag**2 + TINY)
+    power = torch.sqrt(0.5 * (full.real**2 + full.imag**2).sum((-1, -2)) + TINY)
+    return torch.lerp(plain[..., 0, 0], power / size * mean, clear.to(plain.dtype))
+
+
+TINY = 1e-60  # -600 dB: keeps roots of nothing differentiable
 
 
 def dyad(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f 3 3"]:
     """What edges do to world field vectors: -B_out W B_in^T."""
-    w, own = _acts(at, i, level, True)
+    w, own, _ = _acts(at, i, level, True)
     b_in, b_out = w.frame(-w.u_in, w.u_in), w.frame(w.u_out, w.u_out)
     b_in, b_out = b_in[:, None].to(own.dtype), b_out[:, None].to(own.dtype)
     return -(b_out @ own @ b_in.mT)

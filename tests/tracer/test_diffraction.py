@@ -67,6 +67,24 @@ def test_the_total_field_has_no_step_and_no_kink_at_shadow_boundaries(
     assert abs(complex(h[2] - h[1]) - (before + after)) <= slack * (abs(before) + abs(after))
 
 
+@pytest.mark.parametrize("surface", ["metal", "stone"])
+def test_unpolarised_links_have_the_mean_power_deep_in_a_shadow(surface):
+    """Far from all boundaries |h|^2 is the mean over the polarisations: here V is along the edge and H
+    across it, and nothing turns one into the other."""
+    block = Node("/b", Body(Box([1.0, 1.0, 40.0]), SURFACES[surface]), Pose.identity())
+    power = {}
+    for p in ("none", "V", "H"):
+        tx = radio("/t", -6.0, 3.0, 0.0, polarization=p)
+        # round the corner (-1, -1), well inside the shadow of the block, below its face y = -1
+        rx = [radio(f"/r{k}", 4.0, -1.6 - 0.3 * k, 0.0, polarization=p) for k in range(3)]
+        result = simulate(Scene((block,), (tx,), tuple(rx)), F, QUALITY)
+        order = torch.argsort(result.paths.length)
+        power[p] = result.channel.gain[order, 0].abs() ** 2
+    expected = 0.5 * (power["V"] + power["H"])
+    assert len(expected) >= 3 and bool((expected > 0).all())
+    assert float((10 * torch.log10(power["none"] / expected)).abs().max()) < 0.5
+
+
 def test_there_is_a_field_in_the_shadow_and_less_of_it_further_in():
     graze = math.atan2(0.5, 5.0)
     h = _around(SURFACES["metal"], "H", [graze * s for s in (0.9, 0.6, 0.3)]).abs()

@@ -122,6 +122,24 @@ def wedge_terms(
     return scale * value
 
 
+def clearance(
+    phi_in: Float[Tensor, "*#b"],
+    phi_out: Float[Tensor, "*#b"],
+    beta0: Float[Tensor, "*#b"],
+    n: Float[Tensor, "*#b"],
+    s_in: Float[Tensor, "*#b"],
+    s_out: Float[Tensor, "*#b"],
+    k: Float[Tensor, "*#b"],
+) -> Float[Tensor, "*b"]:
+    """How far from all shadow boundaries: the product of |F|^2 of the four terms, 0 (with slope 0) on
+    a boundary and 1 where Keller's non-uniform theory holds."""
+    delta, _, _, _, sharpness = _boundaries(phi_in, phi_out, beta0, n, s_in, s_out, k)
+    z = sharpness * torch.sin(0.5 * delta).abs()
+    g = erfcx_diagonal(z)
+    square = math.pi * z * z * (g.real**2 + g.imag**2)  # |F|^2 of F = sqrt(pi) e^{j pi/4} z G(z)
+    return square.clamp(max=1.0).prod(-1)
+
+
 def slope_terms(
     phi_in: Float[Tensor, "*#b"],
     phi_out: Float[Tensor, "*#b"],
