@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
+from rfsg.scene.antennas import basis
 from rfsg.scene.radios import Radio, amplitude, field_components
 from rfsg.scene.world import World, unit
 from rfsg.tracer.acting import Acting, dyad_of, scalar
@@ -162,20 +163,12 @@ def _through(
 def _basis(
     radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
 ) -> Float[Tensor, "p 2 3"]:
-    """Rows theta-hat and phi-hat, in the world, of each path's radio along a direction.
-
-    Of the radio's own frame (3GPP TR 38.901 section 7.1); on its z axis phi-hat is taken as +y.
-    """
+    """Rows theta-hat and phi-hat, in the world, of each path's radio along a direction."""
     if not radios:
         return direction.new_zeros(0, 2, 3)
     rotation = torch.stack([r.rotation.to(direction) for r in radios])[index]
     local = torch.einsum("pij,pi->pj", rotation, direction)
-    flat = torch.stack([-local[:, 1], local[:, 0], torch.zeros_like(local[:, 0])], -1)
-    pole = (flat * flat).sum(-1, keepdim=True) < 1e-24
-    y_axis = torch.tensor([0.0, 1.0, 0.0], dtype=flat.dtype, device=flat.device)
-    phi = unit(torch.where(pole, y_axis, flat))
-    both = torch.stack([torch.linalg.cross(phi, local), phi], 1)
-    return both @ rotation.mT
+    return basis(local) @ rotation.mT
 
 
 def _between_ports(
