@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from rfsg.tracer import acting, diffraction, refract, scatter
+from rfsg.tracer import acting, refract, scatter, wedge
 from rfsg.tracer.acting import Acting
 from rfsg.tracer.records import Act
 
@@ -12,14 +12,14 @@ Rule = Callable[[Acting, Tensor, int], Tensor]  # (at, rows of paths, level) -> 
 
 COEFFICIENT: dict[Act, Rule] = {
     Act.REFLECT: acting.reflection,
-    Act.DIFFRACT: diffraction.coefficient,
+    Act.DIFFRACT: wedge.coefficient,
     Act.SCATTER: scatter.coefficient,
     Act.ENTER: refract.coefficient,
     Act.LEAVE: refract.coefficient,
 }
 DYAD: dict[Act, Rule] = {
     Act.REFLECT: acting.reflection_dyad,
-    Act.DIFFRACT: diffraction.dyad,
+    Act.DIFFRACT: wedge.dyad,
     Act.SCATTER: scatter.dyad,
     Act.ENTER: refract.dyad,
     Act.LEAVE: refract.dyad,
