@@ -57,7 +57,7 @@ def channel(
     # caustic passed advances the phase by pi/2 (exp(+j 2 pi f t); Kouyoumjian and Pathak 1974, Eq. 6)
     phase = (
         2.0 * torch.pi * frequency[None] * excess[:, None]
-        + 0.5 * torch.pi * paths.caustics[:, None]
+        + 0.5 * torch.pi * paths.caustics[:, None].double()  # an integer's product is float32
     )
     scale = scale * way * torch.polar(torch.ones_like(phase), phase)
     at = Acting(world, paths, u, frequency, edges)
