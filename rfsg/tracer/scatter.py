@@ -35,6 +35,7 @@ from rfsg.tracer.acting import Acting, dyad_of, scalar
 from rfsg.tracer.faces import Planes, moving_planes_of
 from rfsg.tracer.images import fold, images_of
 from rfsg.tracer.implicit import segments
+from rfsg.tracer.march import FORWARD
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Act, Found, Paths, Status
 from rfsg.tracer.tiles import (
@@ -93,8 +94,7 @@ def paths_of(
     ``quality.depth`` allows a second interaction.
 
     Raises ValueError when tiles times links exceed ``MOST_TILES``; mirrors beside the tile are left
-    out first. Differentiable in poses, sizes, positions and materials; tiles of curved faces keep
-    their areas.
+    out first. Differentiable in poses, shapes, positions and materials.
     """
     if not (quality.diffuse and quality.depth and len(tx) and len(rx)):
         return Found()
@@ -352,7 +352,8 @@ def dyad(at: Acting, i: Int[Tensor, "m"], level: int) -> Complex[Tensor, "m f 3 
     turn = _least_rotation(contact.outgoing, out)
     share = _cross_shares(at.world)[which]
     co = torch.sqrt(1.0 - share) * _phase(at, i, level, 0)
-    cross = torch.sqrt(share) * _phase(at, i, level, 1) * _forwards(at.paths, i)
+    cross = torch.sqrt(share) * _phase(at, i, level, 1)
+    cross = cross * _forwards(at.world, which, contact.incoming, out)
     eye = torch.eye(3, dtype=turn.dtype, device=turn.device)
     both = co[:, None, None] * eye + cross[:, None, None] * _cross_matrix(out)
     return (both @ turn.to(both.dtype))[:, None] @ mirror
@@ -370,13 +371,14 @@ def _cross_shares(world: World) -> Float[Tensor, "n"]:
     return torch.tensor(shares, dtype=torch.float64, device=world.device)[world.surface_of_node]
 
 
-def _forwards(paths: Paths, i: Tensor) -> Float[Tensor, "m"]:
-    """+1 one way along a path and -1 the other way: a quarter turn changes its sign under reversal,
-    and this makes up for it, so that a reciprocal tile stays so."""
-    way = paths.vertices[i, -1] - paths.vertices[i, 0]
-    way = way.detach()
-    first = (way != 0).to(torch.int64).argmax(1)
-    return torch.where(way.gather(1, first[:, None])[:, 0] < 0, -1.0, 1.0).to(way)
+def _forwards(
+    world: World, which: Tensor, incoming: Float[Tensor, "m 3"], outgoing: Float[Tensor, "m 3"]
+) -> Float[Tensor, "m"]:
+    """+1 for one way over a tile and -1 for the other, told apart in the object's own frame: a
+    quarter turn changes its sign under reversal, and this makes up for it, so that a tile that is
+    reciprocal without cross-polarisation stays so with it."""
+    way = world.direction_object(which, incoming + outgoing).detach()
+    return torch.where(way @ way.new_tensor(FORWARD) < 0, -1.0, 1.0).to(way)
 
 
 def _least_rotation(

@@ -29,6 +29,8 @@ from rfsg.tracer.march import march
 
 GAUSS = 3.0**-0.5  # the two Gauss-Legendre points on [-1, 1], of equal weight
 SUB = 4  # lines per tile and direction on curved faces
+GRAZING = 0.01  # cosine: a line this flat on a surface stands for almost no area, and stays
+TIE = 1e-6  # relative: points of a lattice lie as near as each other but for rounding
 FINEST = 60  # halvings of a planar tile: a radio a nanometre above a kilometre of ground
 UNBOUNDED = 32.0  # a face without an end reaches this many times the path's own size
 
@@ -184,23 +186,21 @@ def planar_tiles(planes: Planes, grounds: Grounds, cells: Cells, count: int) -> 
 def curved_tiles(world: World, node: int, count: int) -> Tiles:
     """Tiles of a bounded object of any shape: about 6 count^2 of them on a convex one.
 
-    Differentiable in the pose and, along the normal, in the shape; the areas are not.
+    Differentiable in pose and shape: meetings slide along their lines, which keep their place in the
+    bounds.
     """
-    shape = world.scene.nodes[node].body.shape
-    with torch.no_grad():
-        place, normal, area, key = _meetings(shape, count, world.device)
-        tile, slot, keys, q = _slots(key)
+    place, slope, area, key = _meetings(world.scene.nodes[node].body.shape, count, world.device)
+    tile, slot, keys, q = _slots(key)
     k = len(keys)
     which = torch.full((len(tile),), node, device=world.device)
-    point = _on_surface(world, which, world.point_world(which, place))
-    normal = world.direction_world(which, normal)
-    area = area * world.scale[node].detach() ** 2
 
     def laid_out(values: Tensor) -> Tensor:
         out = values.new_zeros(k, q, *values.shape[1:])
         return out.index_put((tile, slot), values)
 
-    points, normals, areas = laid_out(point), laid_out(normal), laid_out(area)
+    points = laid_out(world.point_world(which, place))
+    normals = laid_out(world.direction_world(which, slope))
+    areas = laid_out(area * world.scale[node] ** 2)
     each = torch.arange(k, device=world.device)
     middle = nearest(points, areas > 0, mean(points, areas))
     centre = points[each, middle]
@@ -220,9 +220,10 @@ def mean(point: Float[Tensor, "k q 3"], weight: Float[Tensor, "k q"]) -> Float[T
 def nearest(
     point: Float[Tensor, "k q 3"], allowed: Bool[Tensor, "k q"], place: Float[Tensor, "k 3"]
 ) -> Int[Tensor, "k"]:
-    """Which of a tile's allowed points lies nearest to a place."""
+    """Which of a tile's allowed points lies nearest to a place; the first of those that tie."""
     away = (point - place[:, None]).norm(dim=-1)
-    return torch.where(allowed, away, torch.inf).argmin(1)
+    order = torch.arange(point.shape[1], device=point.device)
+    return torch.where(allowed, away * (1.0 + TIE * order), torch.inf).argmin(1)
 
 
 def hashed(key: Int[Tensor, "k c"]) -> Int[Tensor, "k"]:
@@ -251,7 +252,7 @@ def _meetings(
         grid = torch.cartesian_prod(line, line)
         origin = low.expand(len(grid), 3).clone()
         origin[:, across] += (grid + 0.5) * side
-        for row, sheet, point in _ends(shape, origin, axis, float(high[axis] - low[axis])):
+        for row, sheet, point in _ends(shape, origin, axis, float((high - low).detach()[axis])):
             normal = _normal(shape, point)
             facing = normal[:, axis]
             label = torch.stack(
@@ -275,21 +276,49 @@ def _ends(
     """(line, which stretch of the line, point) where lines along an axis enter, and where they leave."""
     direction = torch.zeros_like(origin)
     direction[:, axis] = 1.0
+    with torch.no_grad():
+        if shape.convex:
+            enter, leave = shape.interval(origin, direction)
+            row = torch.nonzero(leave > enter).squeeze(-1)
+            enter, leave = enter[row], leave[row]
+        else:
+            whole = torch.full_like(origin[:, 0], length)
+            row, enter, leave = march(shape, origin, direction, whole, COARSE)
+            order = torch.argsort(row, stable=True)
+            row, enter, leave = row[order], enter[order], leave[order]
+        number = torch.arange(len(row), device=row.device)
+        fresh = torch.ones_like(row, dtype=torch.bool)
+        fresh[1:] = row[1:] != row[:-1]
+        start = torch.where(fresh, number, torch.zeros_like(number))
+        sheet = number - (torch.cummax(start, 0).values if len(row) else start)
+    start, along = origin[row], direction[row]
     if shape.convex:
-        enter, leave = shape.interval(origin, direction)
-        row = torch.nonzero(leave > enter).squeeze(-1)
-        enter, leave = enter[row], leave[row]
+        enter, leave = shape.interval(start, along)  # of hits alone, with gradients
+        ends = [start + t[:, None] * along for t in (enter, leave)]
     else:
-        whole = torch.full((len(origin),), length, dtype=origin.dtype, device=origin.device)
-        row, enter, leave = march(shape, origin, direction, whole, COARSE)
-        order = torch.argsort(row, stable=True)
-        row, enter, leave = row[order], enter[order], leave[order]
-    number = torch.arange(len(row), device=row.device)
-    fresh = torch.ones_like(row, dtype=torch.bool)
-    fresh[1:] = row[1:] != row[:-1]
-    sheet = number - torch.cummax(torch.where(fresh, number, 0), 0).values if len(row) else row
-    for t in (enter, leave):
-        yield row, sheet, origin[row] + t.to(origin)[:, None] * direction[row]
+        ends = [_slid(shape, start, along, t.to(origin)) for t in (enter, leave)]
+    for point in ends:
+        yield row, sheet, point
+
+
+def _slid(shape: Shape, start: Tensor, along: Tensor, t: Tensor) -> Tensor:
+    """Points at searched roots t, moved on along their lines to the surface, and with it."""
+    with torch.no_grad():
+        for _ in range(2):
+            t = t - _overshoot(shape, start + t[:, None] * along, along)
+    point = start + t[:, None] * along
+    return point - _overshoot(shape, point, along)[:, None] * along
+
+
+def _overshoot(shape: Shape, point: Tensor, along: Tensor) -> Tensor:
+    """f / (df/dt), by one Newton step; nothing where the line grazes."""
+    value = shape.sdf(point)
+    with torch.no_grad():
+        gradient = shape.value_and_gradient(point)[1]
+        slope = (gradient * along).sum(-1)
+        grazing = slope.abs() < GRAZING * gradient.norm(dim=-1).clamp(min=1e-12)
+    step = value / torch.where(grazing, torch.ones_like(slope), slope)
+    return torch.where(grazing, torch.zeros_like(step), step)
 
 
 def _normal(shape: Shape, point: Tensor) -> Tensor:
@@ -307,13 +336,3 @@ def _slots(key: Int[Tensor, "m 5"]) -> tuple[Tensor, Tensor, Int[Tensor, "k 5"],
     slot = torch.empty_like(tile)
     slot[order] = torch.arange(len(tile), device=tile.device) - first[tile[order]]
     return tile, slot, keys, int(size.max())
-
-
-def _on_surface(world: World, which: Tensor, point: Tensor) -> Tensor:
-    """Points moved along the normal to the surface, and with it where it moves."""
-    with torch.no_grad():
-        value, gradient = world.value_and_gradient(which, point)
-        slope = (gradient * gradient).sum(-1, keepdim=True).clamp(min=1e-12)
-        step = gradient / slope
-        point = point - value[:, None] * step
-    return point - (world.sdf(which, point))[:, None] * step
