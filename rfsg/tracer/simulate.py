@@ -23,6 +23,13 @@ from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.launch import SearchReport, search
 from rfsg.tracer.plan import Plan, Quality, make_plan
 from rfsg.tracer.records import Chains, Channel, Paths, Status
+from rfsg.tracer.response import (
+    ImpulseResponse,
+    Taps,
+    frequency_response,
+    impulse_response,
+    taps,
+)
 from rfsg.tracer.solve import solve
 
 Progress = Callable[[str], None]
@@ -50,6 +57,24 @@ class Result:
     def path_gain(self) -> Float[Tensor, "t r f"]:
         """|h(f)|^2, the coherent path gain (linear)."""
         return self.transfer().abs() ** 2
+
+    def size(self) -> tuple[int, int]:
+        """How many transmitters and receivers: what the functions of a channel ask for."""
+        return len(self.scene.transmitters), len(self.scene.receivers)
+
+    def frequency_response(
+        self, frequency: Float[Tensor, "k"], time: Float[Tensor, "s"] | None = None
+    ) -> Complex[Tensor, "t r s k"]:
+        """h(f, t) at any frequencies [Hz] and times [s]; see ``response.frequency_response``."""
+        return frequency_response(self.channel, *self.size(), frequency, time)
+
+    def impulse_response(self, time: Float[Tensor, "s"] | None = None) -> ImpulseResponse:
+        """Delays and complex gains of every link's paths; see ``response.impulse_response``."""
+        return impulse_response(self.channel, *self.size(), time)
+
+    def taps(self, bandwidth: float, time: Float[Tensor, "s"] | None = None) -> Taps:
+        """Taps of the baseband channel sampled at a bandwidth [Hz]; see ``response.taps``."""
+        return taps(self.channel, *self.size(), bandwidth, time=time)
 
     def links(self) -> list[Link]:
         """One record per transmitter and receiver, at the first frequency."""

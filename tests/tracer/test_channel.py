@@ -240,6 +240,16 @@ def test_portions_do_not_change_the_response(monkeypatch):
     assert torch.allclose(taps(c, 1, 3, 20e6).gain, sampled, rtol=1e-12, atol=1e-14)
 
 
+def test_a_result_answers_for_its_own_channel():
+    result = simulate(room(), real([CARRIER, 5e9]), Quality(depth=0))
+    f, t = real([CARRIER, 5e9]), real([0.0, 1e-3])
+    h = result.frequency_response(f, t)
+    assert torch.allclose(h[:, :, 0], result.transfer(), rtol=1e-9)
+    assert torch.allclose(result.impulse_response(t).gain.sum(2)[..., 0], result.transfer())
+    own = taps(result.channel, 1, 4, 20e6)
+    assert torch.equal(result.taps(20e6).gain, own.gain) and result.size() == (1, 4)
+
+
 def test_one_carrier_gives_the_whole_band_where_materials_do_not_turn():
     """Between metal walls gains go as the wavelength: 20 % of band from the carrier alone."""
     metal = [box_node(n.path, n.pose.translation.tolist(), n.body.shape.half_size.tolist(),
