@@ -11,8 +11,10 @@ PEERS = Path(__file__).resolve().parents[1] / "benchmarks" / "peers"
 sys.path.insert(0, str(PEERS))
 
 import cases  # noqa: E402
+import edges  # noqa: E402
 import rfsg_side  # noqa: E402
 import truth  # noqa: E402
+import waves  # noqa: E402
 from differences import Compared, matched  # noqa: E402
 from exchange import Traced  # noqa: E402
 from explain import UNEXPLAINED, cause_of  # noqa: E402
@@ -21,21 +23,21 @@ COSINES = np.array([1.0, 0.8, 0.5, 0.1])
 
 
 def test_layer_of_vacuum_only_delays():
-    te_r, tm_r, te_t, tm_t = truth.layer(COSINES, 1.0, 0.1, 2.4e9)
-    way = np.exp(-2j * np.pi * 2.4e9 / truth.C * 0.1 * COSINES)
+    te_r, tm_r, te_t, tm_t = waves.layer(COSINES, 1.0, 0.1, 2.4e9)
+    way = np.exp(-2j * np.pi * 2.4e9 / waves.C * 0.1 * COSINES)
     np.testing.assert_allclose([te_r, tm_r], 0.0, atol=1e-15)
     np.testing.assert_allclose([te_t, tm_t], [way, way], rtol=1e-13)
 
 
 def test_lossless_layer_keeps_energy():
-    r, t = np.split(np.abs(truth.layer(COSINES, 4.3, 0.07, 5e9)) ** 2, 2)
+    r, t = np.split(np.abs(waves.layer(COSINES, 4.3, 0.07, 5e9)) ** 2, 2)
     np.testing.assert_allclose(r + t, 1.0, rtol=1e-13)
 
 
 def test_thick_lossy_layer_is_a_half_space():
     """Fresnel at normal incidence, and next to nothing at Brewster's angle in TM."""
     eps = 4.0 - 0.05j
-    r = truth.layer(np.array([1.0, 1 / np.sqrt(5.0)]), eps, 50.0, 5e9)
+    r = waves.layer(np.array([1.0, 1 / np.sqrt(5.0)]), eps, 50.0, 5e9)
     n = np.sqrt(eps)
     assert r[0, 0] == pytest.approx((1 - n) / (1 + n), rel=1e-12)
     assert r[1, 0] == pytest.approx(-r[0, 0], rel=1e-12)
@@ -54,7 +56,7 @@ def test_room_has_the_image_lattice():
     image = n * size + np.where(n % 2 == 0, tx, size - tx)
     for r, rx in enumerate(case.receivers):
         expected = np.sort(np.linalg.norm(image - np.array(rx), axis=1))
-        lengths = np.sort(found.delay[found.rx == r]) * truth.C
+        lengths = np.sort(found.delay[found.rx == r]) * waves.C
         np.testing.assert_allclose(lengths, expected, rtol=1e-12)
 
 
@@ -76,8 +78,8 @@ def test_two_ray():
     case = cases.named("two-ray 2.4 GHz")
     found = truth.images(case)
     d = case.receivers[3][0]
-    direct, bounced = found.gain[found.rx == 3] * 4 * np.pi * 2.4e9 / truth.C
-    eps, cosine = truth.permittivity("concrete", 2.4e9), 11.5 / np.hypot(d, 11.5)
+    direct, bounced = found.gain[found.rx == 3] * 4 * np.pi * 2.4e9 / waves.C
+    eps, cosine = waves.permittivity("concrete", 2.4e9), 11.5 / np.hypot(d, 11.5)
     root = np.sqrt(eps - 1 + cosine**2)
     assert direct == pytest.approx(1 / np.hypot(d, 8.5), rel=1e-12)
     tm = (eps * cosine - root) / (eps * cosine + root)
@@ -95,7 +97,56 @@ def test_glint_and_divergence():
     k, onward = ((b - a) / np.linalg.norm(b - a) for a, b in ((tx, p), (p, rx)))
     np.testing.assert_allclose(onward, k - 2 * (k @ n) * n, atol=1e-12)
     assert np.linalg.norm(p - centre) == pytest.approx(1.0, rel=1e-12)
-    assert truth.divergence(3.0, 4.0, 0.6, 1e9) == pytest.approx(1 / 7, rel=1e-6)
+    assert waves.divergence(3.0, 4.0, 0.6, 1e9) == pytest.approx(1 / 7, rel=1e-6)
+
+
+@pytest.mark.parametrize("polarization", ["V", "H"])
+def test_edge_closes_the_gaps(polarization):
+    """Across the ends of the reflection and of the direct ray the whole field goes on smoothly."""
+    case = replace(cases.named("wedge V"), polarization=polarization)
+    low, high = _either_side(case)
+    for ray in (0, 1):
+        assert abs(high[ray] - low[ray]) < 0.01 * abs(low[ray])
+    bare = replace(case, diffraction=False)
+    low, high = _either_side(bare)
+    assert abs(high[0] - low[0]) > 0.3 * abs(low[0])  # the gap is there to be closed
+
+
+def _either_side(case):
+    """h a ten-thousandth of a degree before and after both ends."""
+    x, y, z = case.transmitter
+    ends = np.array([np.arctan2(-y, x), np.arctan2(-y, -x)])
+    out = []
+    for turn in np.radians([-1e-4, 1e-4]):
+        angles = ends + turn
+        places = tuple((5 * float(np.cos(a)), 5 * float(np.sin(a)), z) for a in angles)
+        one = replace(case, receivers=places)
+        out.append(truth.images(one).transfer(case.frequency, 2))
+    return out
+
+
+def test_edge_is_reciprocal_and_shorts_the_face():
+    """Both ways the same gain; no field along a conductor next to its face."""
+    case, a, b = cases.named("wedge V"), (-6.1, 3.2, 0.2), (4.0, -2.0, 1.3)
+    gain = []
+    for tx, rx in ((a, b), (b, a)):
+        one = replace(case, transmitter=tx, receivers=(rx,))
+        (edge,) = (e for e in edges.bending(one, np.array(rx)) if not e.point[:2].any())
+        gain.append((edges.CONDUCTOR * edges.terms(one, edge, np.array(rx))).sum())
+    assert gain[0] == pytest.approx(gain[1], rel=1e-12)
+    near = replace(case, receivers=((4.0, -1e-6, 1.3), (4.0, -1.0, 1.3)))
+    field = np.abs(truth.images(near).transfer(case.frequency, 2))
+    assert field[0] < 1e-3 * field[1]
+
+
+def test_rough_wall_far_away():
+    """A tile seen from afar: area cos cos / pi over both squared distances, of S^2 |R|^2."""
+    tile = cases.Wall("w", (0.0, -0.05, -0.05), (0.1, 0.05, 0.05), "-x", scattering=0.5)
+    case = cases.Case("", (tile,), (-40.0, 0.0, 0.0), ((-30.0, 30.0, 0.0),), 2.4e9, 1)
+    r = waves.layer(1.0, waves.permittivity("concrete", 2.4e9), 0.1, 2.4e9)[0]
+    lobe = np.sqrt(0.5) / np.pi * 0.01 / (40.0**2 * 1800.0)
+    expected = 0.25 * abs(r) ** 2 * lobe * (waves.C / 2.4e9 / 4 / np.pi) ** 2
+    assert truth.diffuse_power(case)[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_icosphere():
@@ -126,7 +177,7 @@ def slab() -> Compared:
     return Compared(case, rfsg_side.trace(case), truth.solve(case), truth.solve(case))
 
 
-@pytest.mark.parametrize("name", ["two-ray 28 GHz", "box moved 28 GHz", "slab 28 GHz"])
+@pytest.mark.parametrize("name", ["two-ray 28 GHz", "box moved 28 GHz", "slab 28 GHz", "wedge H"])
 def test_rfsg_is_the_closed_form(name):
     case = cases.named(name)
     case = replace(case, receivers=(*case.receivers[:2], case.receivers[-1]))
@@ -157,8 +208,8 @@ def test_known_causes_are_recognised(slab):
         np.linalg.norm(np.diff(exact.polyline(p, np.array(case.transmitter), rx), axis=0), axis=1)
         for p, rx in enumerate(np.array(case.receivers)[exact.rx])
     ]
-    straight = np.array([x.sum() for x in lengths]) / truth.C
-    turn = np.where(exact.crossed > 0, 0.1 * exact.departure[:, 0] / truth.C, 0.0)
+    straight = np.array([x.sum() for x in lengths]) / waves.C
+    turn = np.where(exact.crossed > 0, 0.1 * exact.departure[:, 0] / waves.C, 0.0)
     turn += exact.delay - straight
     gain = exact.gain * np.exp(-2j * np.pi * case.frequency * turn)
     peer = replace(exact, gain=gain, delay=straight)

@@ -23,6 +23,7 @@ class Wall:
     high: Point
     front: str  # "+x", "-x", ...
     itu: str = "concrete"
+    scattering: float = 0.0  # S, Lambertian, nothing cross-polarised
 
     @property
     def thickness(self) -> float:
@@ -111,6 +112,10 @@ class Case:
     refraction: bool = False
     move: tuple[str, Point] | None = None
     floor_db: float = -200.0
+    polarization: str = "V"
+    receiver_polarization: str = ""  # "": the same
+    diffraction: bool = False  # round one edge, without reflections beside it
+    diffuse: bool = False
 
     def standing(self) -> tuple[Thing, ...]:
         """The things where they stand once the move is made."""
@@ -248,8 +253,39 @@ def canyons() -> list[Case]:
     ]
 
 
+def wedges() -> list[Case]:
+    """The corner of a tall metal building, receivers all round it: lit, reflected, in shadow; the
+    last four on either side of where the reflection and the direct ray end."""
+    corner = (Block("corner", (0.0, 0.0, -30.0), (30.0, 30.0, 30.0), "conductor"),)
+    x, y = -6.1, 3.2
+    ends = np.degrees([np.arctan2(-y, x), np.arctan2(-y, -x)]) % 360.0
+    beside = (ends[:, None] + [-0.05, 0.05]).reshape(-1)
+    angles = np.radians(np.concatenate([np.linspace(95.0, 355.0, 27), beside]))
+    receivers = tuple((5.0 * float(np.cos(a)), 5.0 * float(np.sin(a)), 1.3) for a in angles)
+    vertical = Case("wedge V", corner, (x, y, 0.2), receivers, 2.4e9, depth=1, diffraction=True)
+    return [vertical, replace(vertical, name="wedge H", polarization="H")]
+
+
+def diffuse() -> list[Case]:
+    """A rough wall; the receivers' power is the sum of what both polarisations get."""
+    wall = (Wall("wall", (0.0, -5.0, -3.0), (0.1, 5.0, 3.0), "-x", scattering=0.6),)
+    receivers = ((-2.0, 2.0, 0.4), (-1.2, -3.0, 1.1), (-4.0, 0.7, -1.3), (-2.7, 4.2, 2.2))
+    case = Case("", wall, (-3.1, -0.9, 0.3), receivers, 2.4e9, depth=1, diffuse=True)
+    return [replace(case, name=f"diffuse V to {p}", receiver_polarization=p) for p in "VH"]
+
+
 def all_cases() -> list[Case]:
-    return [*rooms(), *moved_boxes(), *grounds(), *slabs(), vacuum(), *spheres(), *canyons()]
+    return [
+        *rooms(),
+        *moved_boxes(),
+        *grounds(),
+        *slabs(),
+        vacuum(),
+        *spheres(),
+        *canyons(),
+        *wedges(),
+        *diffuse(),
+    ]
 
 
 def named(name: str) -> Case:

@@ -9,7 +9,13 @@ from exchange import Traced
 from numpy import ndarray
 from scipy.optimize import linear_sum_assignment
 
-THRESHOLD = {"power [dB]": 0.1, "delay [ns]": 0.01, "phase [deg]": 1.0, "link power [dB]": 0.1}
+THRESHOLD = {
+    "power [dB]": 0.1,
+    "delay [ns]": 0.01,
+    "phase [deg]": 1.0,
+    "link power [dB]": 0.1,
+    "scattered power [dB]": 0.1,
+}
 SAME_VERTEX = 0.5  # [m]: of one sequence of objects, farther apart is another path
 KINDS = {0: "", 1: "edge of ", 2: "scattered by "}
 

@@ -7,10 +7,13 @@ rfsg's path or from the closed form, and asks whether that is what was found.
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import edges
 import numpy as np
 import truth
+import waves
 from cases import Ball, Wall
 from differences import THRESHOLD, Compared, Difference, decibel
+from exchange import DIFFRACT
 
 C = 299_792_458.0
 SHORTEST = 1e-2  # [m] constants.py of Sionna RT 2.2: MIN_SEGMENT_LENGTH
@@ -108,6 +111,36 @@ def float32_vertices(c: Compared, d: Difference) -> bool:
     return bool(abs(decibel(there) - decibel(c.peer.gain[d.s])) < THRESHOLD[d.quantity] / 10)
 
 
+# the signs in which Sionna RT 2.2 adds [KP]'s terms on a conductor lit on one face: read off its
+# code (R_0 (D1 - D4) + R_n (D2 - D3) with R_n = -1, in radio_material.py) and off its answers
+PEER_EDGE = np.array([[1, -1, 1, -1], [-1, -1, 1, 1]])
+
+
+def _peer_edge(c: Compared, p: int) -> tuple[complex, float]:
+    """The gain of one of rfsg's diffracted paths with the peer's signs, and the sum of the terms'
+    magnitudes, of which a rounding is a share."""
+    rx = np.array(c.case.receivers[c.rfsg.rx[p]])
+    near = [e for e in edges.bending(c.case, rx) if np.allclose(e.point, c.rfsg.vertex[p, 0])]
+    terms = edges.terms(c.case, near[0], rx)
+    return complex((PEER_EDGE * terms).sum()), float(np.abs(terms).sum())
+
+
+def edge_terms(c: Compared, d: Difference) -> bool:
+    """The peer's answer is the closed form's four terms with other signs."""
+    if d.quantity == "link power [dB]":
+        mine = np.nonzero(c.rfsg.rx == d.rx)[0].tolist()
+        bent = [p for p in mine if (c.rfsg.kind[p] == DIFFRACT).any()]
+        turn = np.exp(-2j * np.pi * np.mod(c.case.frequency * c.rfsg.delay, 1.0))
+        gain = c.rfsg.gain.copy()
+        gain[bent] = [_peer_edge(c, p)[0] for p in bent]
+        there = decibel((gain * turn)[mine].sum())
+        return bool(bent) and abs(there - c.link_power(c.peer)[d.rx]) < THRESHOLD[d.quantity]
+    if d.p < 0 or d.s < 0 or not (c.rfsg.kind[d.p] == DIFFRACT).any():
+        return False
+    expected, size = _peer_edge(c, d.p)
+    return abs(c.peer.gain[d.s] - expected) < 0.01 * size
+
+
 def _on_ball(c: Compared, d: Difference) -> Ball | None:
     traced, p = (c.rfsg, d.p) if d.p >= 0 else (c.peer, d.s)
     ball = c.case.things[0]
@@ -130,7 +163,7 @@ def flat_facets(c: Compared, d: Difference) -> bool:
     if d.quantity == "power [dB]":
         s1, s2 = _segments(c, d.p)
         cosine = np.sqrt((1 - c.rfsg.departure[d.p] @ -c.rfsg.arrival[d.p]) / 2)
-        flat = 1 / (s1 + s2) / truth.divergence(s1, s2, cosine, ball.radius)
+        flat = 1 / (s1 + s2) / waves.divergence(s1, s2, cosine, ball.radius)
         return bool(abs(d.value - decibel(flat)) < 0.25 * abs(d.value))
     if d.quantity in ("delay [ns]", "phase [deg]"):
         shift = abs(c.peer.delay[d.s] - c.rfsg.delay[d.p])
@@ -185,6 +218,17 @@ CAUSES = (
         float32_vertices,
     ),
     Cause(
+        "signs of an edge's terms",
+        "On an edge both sides evaluate the four terms of Kouyoumjian and Pathak (1974), but "
+        "Sionna RT 2.2 adds them with other signs (`_diffraction_matrix` in "
+        "`radio_material.py`): the term that belongs to the reflection has the sign that does not "
+        "close the gap which the reflected ray leaves where it ends, and the field across the "
+        "edge has the terms of the field along it. The rule adds the closed form's terms with "
+        "those signs and finds the peer's gain. That a field cannot step is the argument; see "
+        "the table of steps.",
+        edge_terms,
+    ),
+    Cause(
         "flat facets",
         "A mesh's triangle is a plane mirror. Most receivers see themselves in none, the rest in "
         "one that sends on lambda / (4 pi L), as if the ball were flat; its point lies as far off "
@@ -193,6 +237,14 @@ CAUSES = (
         "geometrical optics.",
         flat_facets,
     ),
+)
+SCATTERED = Cause(
+    "polarisation of what scatters",
+    "Sionna RT gives scattered waves the polarisation they came with, vertical to vertical; rfsg "
+    "turns the field as the mirror's reflection, and from there to the tile's direction, so that "
+    "a part of it is horizontal. The sum over both polarisations is the same in both, and that "
+    "of the closed form. Effective roughness is a model of power and does not say which is right.",
+    lambda c, d: False,  # takes two cases to see: compare.py
 )
 UNEXPLAINED = "UNEXPLAINED"
 

@@ -13,7 +13,7 @@ from exchange import DIFFRACT, REFLECT, SCATTER, Traced, file_of
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Box, HalfSpace, Sphere
-from rfsg.objects.surfaces.interface import DielectricHalfSpace
+from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
@@ -22,18 +22,21 @@ from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Act
 from rfsg.tracer.simulate import simulate
 
+TILES = 64  # per face and direction, at least
 KINDS = {Act.REFLECT: REFLECT, Act.DIFFRACT: DIFFRACT, Act.SCATTER: SCATTER}
 
 
 def node(thing: cases.Thing) -> Node:
-    surface = DielectricHalfSpace(itu=thing.itu)
+    perfect = thing.itu == "conductor"
+    surface = Conductor() if perfect else DielectricHalfSpace(itu=thing.itu)
     if isinstance(thing, cases.Ground):
         return Node(f"/{thing.name}", Body(HalfSpace(), surface), Pose.identity())
     if isinstance(thing, cases.Ball):
         return Node(f"/{thing.name}", Body(Sphere(thing.radius), surface), Pose.at(*thing.centre))
     low, high = np.array(thing.low), np.array(thing.high)
     if isinstance(thing, cases.Wall):
-        surface = Slab(thing.thickness, itu=thing.itu)
+        rough = {"coefficient": thing.scattering} if thing.scattering else None
+        surface = Slab(thing.thickness, itu=thing.itu, scattering=rough)
     return Node(
         f"/{thing.name}",
         Body(Box(((high - low) / 2).tolist()), surface),
@@ -42,12 +45,13 @@ def node(thing: cases.Thing) -> Node:
 
 
 def build(case: cases.Case) -> Scene:
+    end = case.receiver_polarization or case.polarization
     receivers = tuple(
-        Radio.at(f"/rx{r}", *p, polarization="V") for r, p in enumerate(case.receivers)
+        Radio.at(f"/rx{r}", *p, polarization=end) for r, p in enumerate(case.receivers)
     )
     scene = Scene(
         tuple(node(t) for t in case.things),
-        (Radio.at("/tx", *case.transmitter, polarization="V"),),
+        (Radio.at("/tx", *case.transmitter, polarization=case.polarization),),
         receivers,
         case.frequency,
     )
@@ -55,7 +59,14 @@ def build(case: cases.Case) -> Scene:
 
 
 def trace(case: cases.Case) -> Traced:
-    result = simulate(build(case), quality=Quality(depth=case.depth, floor_db=case.floor_db))
+    quality = Quality(
+        depth=case.depth,
+        floor_db=case.floor_db,
+        diffraction=int(case.diffraction),
+        diffraction_depth=1,
+        diffuse=TILES if case.diffuse else 0,
+    )
+    result = simulate(build(case), quality=quality)
     paths, channel = result.paths, result.channel
     used = paths.which >= 0
     own = torch.tensor([KINDS.get(a, -1) for a in Act])

@@ -2,7 +2,7 @@
 
     .venv/bin/python sionna_side.py --out DIR CASE ...
 
-Runs in benchmarks/peers/.venv and imports nothing of rfsg. Radios are isotropic, vertically
+Runs in benchmarks/peers/.venv and imports nothing of rfsg. Radios are isotropic and
 polarised; the path solver runs with its defaults (1e6 samples) but for what a case sets. Receivers
 are traced a few at a time: with hundreds in one call it silently runs out of room for candidates.
 """
@@ -22,6 +22,7 @@ from exchange import DIFFRACT, REFLECT, SCATTER, Traced, file_of  # noqa: E402
 from sionna.rt.constants import InteractionType  # noqa: E402
 
 RECEIVERS_AT_ONCE = 25
+DIFFUSE_SAMPLES = 300_000  # each that hits the wall is a path
 KINDS = {
     InteractionType.SPECULAR: REFLECT,
     InteractionType.DIFFRACTION: DIFFRACT,
@@ -49,6 +50,13 @@ def halves(faces: list[np.ndarray]) -> np.ndarray:
     return np.array(corners).reshape(-1, 3, 3)
 
 
+def material(name: str, itu: str, thickness: float, rough: float) -> rt.RadioMaterial:
+    common = {"thickness": thickness, "scattering_coefficient": rough, "color": (0.5, 0.5, 0.5)}
+    if itu == "conductor":
+        return rt.RadioMaterial(name, conductivity=1e10, **common)
+    return rt.ITURadioMaterial(name, itu, **common)
+
+
 def build(case: cases.Case) -> rt.Scene:
     scene = rt.load_scene()
     scene.frequency = case.frequency
@@ -56,12 +64,11 @@ def build(case: cases.Case) -> rt.Scene:
     for thing in case.things:
         round_one = isinstance(thing, cases.Ball)
         drawn = thing.triangles() if round_one else halves(thing.faces())
-        kind = (thing.itu, round(thing.thickness, 9))
+        rough = thing.scattering if isinstance(thing, cases.Wall) else 0.0
+        kind = (thing.itu, round(thing.thickness, 9), rough)
         if kind not in materials:
-            name = f"{thing.itu}-{thing.thickness:g}"
-            materials[kind] = rt.ITURadioMaterial(
-                name, thing.itu, thickness=thing.thickness, color=(0.5, 0.5, 0.5)
-            )
+            name = f"{thing.itu}-{len(materials)}"
+            materials[kind] = material(name, *kind)
         objects.append(
             rt.SceneObject(
                 mi_mesh=mesh(thing.name, drawn), name=thing.name, radio_material=materials[kind]
@@ -71,8 +78,10 @@ def build(case: cases.Case) -> rt.Scene:
     if case.move is not None:
         name, by = case.move
         scene.objects[name].position += mi.Point3f(*by)
-    array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    scene.tx_array = scene.rx_array = array
+    ends = case.polarization, case.receiver_polarization or case.polarization
+    scene.tx_array, scene.rx_array = (
+        rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=p) for p in ends
+    )
     scene.add(rt.Transmitter("tx", position=mi.Point3f(*case.transmitter)))
     for r, place in enumerate(case.receivers):
         scene.add(rt.Receiver(f"rx{r}", position=mi.Point3f(*place)))
@@ -81,8 +90,9 @@ def build(case: cases.Case) -> rt.Scene:
 
 def trace(case: cases.Case) -> Traced:
     parts = []
-    for first in range(0, len(case.receivers), RECEIVERS_AT_ONCE):
-        some = case.receivers[first : first + RECEIVERS_AT_ONCE]
+    at_once = 1 if case.diffuse else RECEIVERS_AT_ONCE
+    for first in range(0, len(case.receivers), at_once):
+        some = case.receivers[first : first + at_once]
         part = _trace(replace(case, receivers=some))
         parts.append(replace(part, rx=part.rx + first))
     return Traced.joined(parts)
@@ -90,7 +100,14 @@ def trace(case: cases.Case) -> Traced:
 
 def _trace(case: cases.Case) -> Traced:
     scene = build(case)
-    paths = rt.PathSolver()(scene, max_depth=case.depth, refraction=case.refraction)
+    paths = rt.PathSolver()(
+        scene,
+        max_depth=case.depth,
+        samples_per_src=DIFFUSE_SAMPLES if case.diffuse else 1_000_000,
+        diffuse_reflection=case.diffuse,
+        refraction=case.refraction,
+        diffraction=case.diffraction,
+    )
     rx, column = np.nonzero(paths.valid.numpy()[:, 0])  # [r t p], one transmitter
     real, imaginary = (x.numpy()[rx, 0, 0, 0, column] for x in paths.a)
     theta_t, phi_t, theta_r, phi_r = (

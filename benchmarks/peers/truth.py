@@ -2,65 +2,21 @@
 
 Flat scenes: the image method (Allen & Berkley 1979, for any rectangles), with exact blocking. Sphere:
 the divergence factor of geometrical optics (Balanis 2012, section 13.3). Coefficients: the single
-layer of Recommendation ITU-R P.2040-4 section 2.2.2. Time convention exp(+j 2 pi f t).
+layer of Recommendation ITU-R P.2040-4 section 2.2.2. Edges: the uniform theory of diffraction for a
+perfect conductor (Kouyoumjian & Pathak 1974, Proc. IEEE 62(11), here [KP]). Time convention exp(+j 2 pi f t).
 """
 
 from itertools import product
 
+import edges
 import numpy as np
 from cases import Ball, Case, Thing, Wall
-from exchange import REFLECT, Traced
+from exchange import DIFFRACT, REFLECT, Traced
 from numpy import ndarray
+from waves import C, antenna, bent, divergence, layer, permittivity
 
-C = 299_792_458.0  # [m/s]
-EPS0 = 8.8541878188e-12  # [F/m], CODATA 2022
-ITU = {  # P.2040-4 Table 3: eps_r = a f^b, sigma = c f^d [S/m], f in GHz, below 40 GHz
-    "concrete": (5.24, 0.0, 0.0462, 0.7822),
-    "brick": (3.91, 0.0, 0.0238, 0.16),
-    "wood": (1.99, 0.0, 0.0047, 1.0718),
-    "glass": (6.31, 0.0, 0.0036, 1.3394),
-    "marble": (7.074, 0.0, 0.0055, 0.9262),
-    "vacuum": (1.0, 0.0, 0.0, 0.0),
-    "metal": (1.0, 0.0, 1e7, 0.0),
-}
+ENDS = 1e-9  # of a segment: what it meets this near to its ends is where it comes from
 INSIDE = 1e-9  # [m] how far beyond a rectangle's edge still counts as on it
-
-
-def permittivity(itu: str, frequency: float) -> complex:
-    a, b, c, d = ITU[itu]
-    f = frequency / 1e9
-    return a * f**b - 1j * c * f**d / (2 * np.pi * frequency * EPS0)
-
-
-def layer(cosine: ndarray | float, eps: complex, thickness: float, frequency: float) -> ndarray:
-    """[4 ...]: R_TE, R_TM, T_TE, T_TM of one layer, from face to face, at cos(incidence)."""
-    k = 2 * np.pi * frequency / C
-    root = np.sqrt(eps - (1 - cosine**2) + 0j)
-    through = np.exp(-1j * k * thickness * root)  # once through the layer
-    out = []
-    for r in (
-        (cosine - root) / (cosine + root),
-        (eps * cosine - root) / (eps * cosine + root),
-    ):
-        loop = 1 - r**2 * through**2
-        out.append((r * (1 - through**2) / loop, (1 - r**2) * through / loop))
-    return np.array([out[0][0], out[1][0], out[0][1], out[1][1]])
-
-
-def theta_hat(direction: ndarray) -> ndarray:
-    """Unit vector of growing angle from +z at a unit direction: vertical polarisation."""
-    flat = np.hypot(direction[0], direction[1])
-    x, y = (1.0, 0.0) if flat == 0 else direction[:2] / flat
-    return np.array([direction[2] * x, direction[2] * y, -flat])
-
-
-def _bent(field: ndarray, k: ndarray, onward: ndarray, n: ndarray, te, tm) -> ndarray:
-    """A field vector after a boundary: s across the plane of incidence, p = s x k within it."""
-    s = np.cross(k, n)
-    if s @ s < 1e-24:
-        s = np.cross(k, np.eye(3)[np.argmin(np.abs(k))])
-    s = s / np.linalg.norm(s)
-    return te * s * (s @ field) + tm * np.cross(s, onward) * (np.cross(s, k) @ field)
 
 
 # flat scenes
@@ -89,7 +45,7 @@ class _Faces:
         parallel = a == b
         t = np.where(parallel, -1.0, a / np.where(parallel, 1.0, a - b))
         point = start + t[..., None] * (end - start)
-        within = (t > 0) & (t < 1)
+        within = (t > ENDS) & (t < 1 - ENDS)
         for edge in (self.u, self.v):
             length = np.linalg.norm(edge[face], axis=-1)
             along = ((point - self.corner[face]) * edge[face]).sum(-1) / length
@@ -116,12 +72,14 @@ def images(case: Case) -> Traced:
     for r, receiver in enumerate(np.array(case.receivers)):
         for depth in range(case.depth + 1):
             sequences = _sequences(len(faces.n), depth)
-            for sequence, points in _reflected(
-                faces, sequences, np.array(case.transmitter), receiver
-            ):
+            ends = np.array(case.transmitter), receiver
+            for sequence, points in _reflected(faces, sequences, *ends):
                 row = _path(case, things, faces, sequence, points)
                 if row is not None:
-                    rows.append((r, faces.owner[sequence], points[1:-1], *row))
+                    kinds = np.full(depth, REFLECT)
+                    rows.append((r, kinds, faces.owner[sequence], points[1:-1], *row))
+        if case.diffraction:
+            rows += [(r, *row) for row in _diffracted(case, faces, receiver)]
     return _traced(case, things, rows)
 
 
@@ -159,7 +117,7 @@ def _path(case: Case, things, faces: _Faces, sequence: ndarray, points: ndarray)
     step = np.diff(points, axis=0)
     length = np.linalg.norm(step, axis=1)
     k = step / length[:, None]
-    field = theta_hat(k[0]).astype(complex)
+    field = antenna(case.polarization, k[0]).astype(complex)
     crossed, excess = 0, 0.0
     for s in range(len(k)):
         own = sequence[max(s - 1, 0) : s + 1]
@@ -171,16 +129,17 @@ def _path(case: Case, things, faces: _Faces, sequence: ndarray, points: ndarray)
             n, thing = faces.n[face], things[faces.owner[face]]
             cosine = abs(k[s] @ n)
             te, tm, _, delay = _crossing(thing, cosine, case.frequency)
-            field = _bent(field, k[s], k[s], n, te, tm)
+            field = bent(field, k[s], k[s], n, te, tm)
             excess += delay
             crossed += 1
         if s < len(sequence):
             n, thing = faces.n[sequence[s]], things[faces.owner[sequence[s]]]
             eps = permittivity(thing.itu, case.frequency)
             te, tm, _, _ = layer(abs(k[s] @ n), eps, thing.thickness, case.frequency)
-            field = _bent(field, k[s], k[s + 1], n, te, tm)
+            rough = thing.scattering if isinstance(thing, Wall) else 0.0
+            field = bent(field, k[s], k[s + 1], n, te, tm) * np.sqrt(1 - rough**2)
     total = length.sum()
-    gain = (theta_hat(-k[-1]) @ field) * C / case.frequency / (4 * np.pi * total)
+    gain = (antenna(case.polarization, -k[-1]) @ field) * C / case.frequency / (4 * np.pi * total)
     gain *= np.exp(2j * np.pi * np.mod(case.frequency * excess, 1.0))
     return crossed, total / C + excess, gain, k[0], -k[-1]
 
@@ -203,6 +162,53 @@ def _crossing(thing: Thing, cosine: float, frequency: float):
     return te, tm, np.angle(te), -turn / (4 * np.pi * step)
 
 
+def _diffracted(case: Case, faces: _Faces, rx: ndarray):
+    """(kinds, items, vertex, crossed, delay, gain, departure, arrival) round each edge in sight."""
+    tx, every = np.array(case.transmitter), np.arange(len(faces.n))
+    for edge in edges.bending(case, rx):
+        if any(faces.meet(every, end, edge.point)[1].any() for end in (tx, rx)):
+            continue
+        first, last = edge.point - tx, rx - edge.point
+        s1, s2 = np.linalg.norm(first), np.linalg.norm(last)
+        gain = (edges.CONDUCTOR * edges.terms(case, edge, rx)).sum()
+        kinds, items = np.array([DIFFRACT]), np.array([edge.item])
+        ends = first / s1, -last / s2
+        yield kinds, items, edge.point[None], 0, (s1 + s2) / C, gain, *ends
+
+
+def diffuse_power(case: Case) -> ndarray:
+    """What a rough wall scatters to each receiver, both polarisations together, by quadrature.
+
+    (lambda / 4 pi)^2 S^2 integral |R|^2 cos(theta_i) p / (d1 d2)^2 dA, p = cos(theta_s) / pi (the
+    effective roughness model, Degli-Esposti et al. 2007, IEEE Trans. AP 55(1), Lambertian).
+    """
+    (wall,) = (t for t in case.things if isinstance(t, Wall))
+    corner, u, v = wall.faces()[0]
+    n = np.cross(u, v) / np.linalg.norm(np.cross(u, v))
+    place, weight = np.polynomial.legendre.leggauss(200)
+    a, b = (x[..., None] for x in np.meshgrid((place + 1) / 2, (place + 1) / 2))
+    point = corner + a * u + b * v
+    area = np.outer(weight, weight) / 4 * np.linalg.norm(np.cross(u, v))
+    first = point - np.array(case.transmitter)
+    d1 = np.linalg.norm(first, axis=-1)
+    k = first / d1[..., None]
+    across = np.cross(k, n)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    field = np.apply_along_axis(lambda x: antenna(case.polarization, x), -1, k)
+    te_share = (field * across).sum(-1) ** 2
+    cosine = -(k @ n)
+    te, tm, _, _ = layer(
+        cosine, permittivity(wall.itu, case.frequency), wall.thickness, case.frequency
+    )
+    power = te_share * np.abs(te) ** 2 + (1 - te_share) * np.abs(tm) ** 2
+    total = []
+    for rx in np.array(case.receivers):
+        d2 = np.linalg.norm(rx - point, axis=-1)
+        lobe = ((rx - point) @ n) / d2 / np.pi
+        total.append((area * power * cosine * lobe / (d1 * d2) ** 2).sum())
+    return np.array(total) * (wall.scattering * C / case.frequency / (4 * np.pi)) ** 2
+
+
 # sphere
 
 
@@ -211,17 +217,17 @@ def sphere(case: Case) -> Traced:
     (ball,) = case.things
     assert isinstance(ball, Ball)
     centre, tx = np.array(ball.centre), np.array(case.transmitter)
-    eps = permittivity(ball.itu, case.frequency)
+    eps, way = permittivity(ball.itu, case.frequency), case.polarization
     rows = []
     for r, rx in enumerate(np.array(case.receivers)):
         u = rx - tx
         near = tx + u * np.clip((centre - tx) @ u / (u @ u), 0, 1)
         wave = C / case.frequency / (4 * np.pi)
-        none = np.zeros(0, int), np.zeros((0, 3))
+        none = np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3))
         if np.linalg.norm(near - centre) > ball.radius:
             distance = np.linalg.norm(u)
             k = u / distance
-            gain = theta_hat(k) @ theta_hat(-k) * wave / distance
+            gain = antenna(way, k) @ antenna(way, -k) * wave / distance
             rows.append((r, *none, 0, distance / C, gain, k, -k))
         glint, n = _glint(centre, ball.radius, tx, rx)
         s1, s2 = float(np.linalg.norm(glint - tx)), float(np.linalg.norm(rx - glint))
@@ -229,16 +235,12 @@ def sphere(case: Case) -> Traced:
         cosine = -float(k @ n)
         spread = divergence(s1, s2, cosine, ball.radius)
         te, tm, _, _ = layer(cosine, eps, ball.thickness, case.frequency)
-        field = _bent(theta_hat(k).astype(complex), k, onward, n, te, tm)
-        gain = (theta_hat(-onward) @ field) * wave * spread
-        rows.append((r, np.array([0]), glint[None], 0, (s1 + s2) / C, gain, k, -onward))
+        field = bent(antenna(way, k).astype(complex), k, onward, n, te, tm)
+        gain = (antenna(way, -onward) @ field) * wave * spread
+        rows.append(
+            (r, np.array([REFLECT]), np.array([0]), glint[None], 0, (s1 + s2) / C, gain, k, -onward)
+        )
     return _traced(case, case.things, rows)
-
-
-def divergence(s1: float, s2: float, cosine: float, radius: float) -> float:
-    """Amplitude [1/m] after a ball: s1 to it, s2 from it (Kouyoumjian & Pathak 1974, eqs. 25-27)."""
-    a, b = 1 / (1 / s1 + 2 / (radius * cosine)), 1 / (1 / s1 + 2 * cosine / radius)
-    return np.sqrt(a * b / ((a + s2) * (b + s2))) / s1
 
 
 def mirroring_facets(ball: Ball, tx: ndarray, rx: ndarray) -> int:
@@ -271,15 +273,16 @@ def _glint(centre: ndarray, radius: float, tx: ndarray, rx: ndarray) -> tuple[nd
 
 def _traced(case: Case, things: tuple[Thing, ...], rows: list) -> Traced:
     deep = max(1, case.depth)
-    item = np.full((len(rows), deep), -1)
+    kind, item = np.full((2, len(rows), deep), -1)
     vertex = np.full((len(rows), deep, 3), np.nan)
-    for p, row in enumerate(rows):
-        item[p, : len(row[1])], vertex[p, : len(row[1])] = row[1], row[2]
-    rx, _, _, crossed, delay, gain, departure, arrival = zip(*rows, strict=True)
+    for p, (_, kinds, items, points, *_) in enumerate(rows):
+        used = slice(0, len(kinds))
+        kind[p, used], item[p, used], vertex[p, used] = kinds, items, points
+    rx, _, _, _, crossed, delay, gain, departure, arrival = zip(*rows, strict=True)
     return Traced(
         names=np.array([t.name for t in things]),
         rx=np.array(rx),
-        kind=np.where(item >= 0, REFLECT, -1),
+        kind=kind,
         item=item,
         vertex=vertex,
         crossed=np.array(crossed),
