@@ -425,7 +425,9 @@ class World:
         depth = torch.zeros_like(self.scale[which])
         for shape, i in self.groups(which):
             depth = depth.index_copy(0, i, depth_behind(shape, patch[i]))
-        return depth * self.scale[which]
+        bounded = torch.isfinite(depth)  # infinity times a scale would have no gradient
+        scaled = torch.where(bounded, depth, 1.0) * self.scale[which]
+        return torch.where(bounded, scaled, depth)
 
 
 FLUSH = 1e-8  # [m] faces this near to each other touch

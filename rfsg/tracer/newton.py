@@ -17,8 +17,12 @@ ROUNDING = 64 * 2.0**-52  # of the coordinates: float64's own, through a Newton 
 
 @dataclass
 class Batch:
-    """Chains of one depth on their way to paths; every field has the chain axis first."""
+    """Chains of one depth on their way to paths; every field has the chain axis first.
 
+    link: a number for each pair of radios, of which two may stand in the same places.
+    """
+
+    link: Int[Tensor, "c"]
     tx: Float[Tensor, "c 3"]
     rx: Float[Tensor, "c 3"]
     which: Int[Tensor, "c d"]
@@ -32,6 +36,7 @@ class Batch:
         """The same chains, those in ``back`` read from the receiver."""
         row, deep = back[:, None], back[:, None, None]
         return Batch(
+            self.link,
             torch.where(row, self.rx, self.tx),
             torch.where(row, self.tx, self.rx),
             torch.where(row, self.which.flip(1), self.which),

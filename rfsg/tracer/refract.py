@@ -331,7 +331,8 @@ def _solved(bender: Bender, paths: Paths, chain: Chain, steps: int) -> Chain:
 
 def _batch(paths: Paths, chain: Chain) -> Batch:
     ends = paths.vertices[chain.row]
-    return Batch(ends[:, 0], ends[:, -1], chain.which, chain.patch, chain.x)
+    link = (paths.tx * (paths.rx.amax() + 1) + paths.rx)[chain.row] if len(paths.rx) else chain.row
+    return Batch(link, ends[:, 0], ends[:, -1], chain.which, chain.patch, chain.x)
 
 
 def _true(bender: Bender, paths: Paths, chain: Chain) -> Int[Tensor, "k"]:

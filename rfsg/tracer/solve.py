@@ -72,6 +72,7 @@ def solve(
     for depth in torch.unique(depth_of).tolist():
         for i in torch.nonzero(depth_of == depth).squeeze(-1).split(quality.chunk):
             batch = Batch(
+                chains.tx[i] * len(rx_position) + chains.rx[i],
                 tx_position[chains.tx[i]],
                 rx_position[chains.rx[i]],
                 chains.which[i, :depth],
@@ -334,11 +335,8 @@ def duplicates(
     i = torch.nonzero(good).squeeze(-1)
     if len(i) < 2:
         return status
-    ends = torch.cat([batch.tx[i], batch.rx[i]], 1)
-    _, end_id = torch.unique(ends, dim=0, return_inverse=True)
-    _, key = torch.unique(
-        torch.cat([end_id[:, None], batch.which[i]], 1), dim=0, return_inverse=True
-    )
+    sequence = torch.cat([batch.link[i, None], batch.which[i]], 1)
+    _, key = torch.unique(sequence, dim=0, return_inverse=True)
     length = segments(vertices[i])[0].sum(1)
     order = torch.argsort(length, stable=True)
     order = order[torch.argsort(key[order], stable=True)]
