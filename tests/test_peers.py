@@ -160,7 +160,8 @@ def test_icosphere():
     normal = np.cross(out[:, 1] - out[:, 0], out[:, 2] - out[:, 0])
     assert (normal * out.mean(1)).sum(1).min() > 0
     middle, up = corners[7].mean(0), normal[7] / np.linalg.norm(normal[7])
-    assert truth.mirroring_facets(ball, middle + 3 * up, middle + 4 * up) == 1
+    seen = truth.mirrored_on_facets(ball, middle + 3 * up, middle + 4 * up)
+    np.testing.assert_allclose(seen, middle[None], atol=1e-12)
 
 
 def test_every_scene_loads():
@@ -229,3 +230,29 @@ def test_unknown_causes_are_not(slab):
         compared = replace(slab, peer=peer)
         assert compared.differences
         assert {cause_of(compared, d) for d in compared.differences} == {UNEXPLAINED}
+
+
+def test_facets_excuse_only_what_facets_do():
+    """A lost glint is put down to the mesh only where no triangle has it; and so is no other power."""
+    ball = cases.Ball("ball", (0.0, 0.0, 0.0), 1.0, facets=320)
+    a, b, c = ball.triangles()[7]
+    up, side = (v / np.linalg.norm(v) for v in (np.cross(b - a, c - a), b - a))
+    middle = (a + b + c) / 3
+    tx, shown = (middle + 3 * up + 2 * s * side for s in (1, -1))
+    hidden = shown + 0.4 * up - 0.7 * np.cross(up, side)
+    assert not len(truth.mirrored_on_facets(ball, tx, hidden))
+    receivers = (tuple(shown.tolist()), tuple(hidden.tolist()))
+    case = cases.Case("", (ball,), tuple(tx.tolist()), receivers, 2.4e9, 1)
+    exact = truth.solve(case)
+    glint = (exact.kind >= 0).any(1)
+    lost = Traced(exact.names, *(getattr(exact, n)[~glint] for n in list(vars(exact))[1:]))
+    causes = {
+        (d.rx, d.quantity): cause_of(k, d)
+        for k in [Compared(case, exact, lost, exact)]
+        for d in k.differences
+    }
+    assert causes[0, "missing in the peer"] == UNEXPLAINED
+    assert causes[1, "missing in the peer"] == "flat facets"
+    loud = replace(exact, gain=np.where(glint, 4.0, 1.0) * exact.gain)  # 12 dB is not 14
+    k = Compared(case, exact, loud, exact)
+    assert {cause_of(k, d) for d in k.differences if d.quantity == "power [dB]"} == {UNEXPLAINED}

@@ -102,7 +102,7 @@ def float32_phase(c: Compared, d: Difference) -> bool:
 
 def float32_vertices(c: Compared, d: Difference) -> bool:
     """The closed form over the peer's own vertices has the peer's power: they are that far off."""
-    if d.quantity != "power [dB]" or c.truth is None or _on_ball(c, d):
+    if d.quantity != "power [dB]" or c.truth is None or _on_ball(c, d.p):
         return False
     rx = np.array(c.case.receivers[d.rx])
     points = c.peer.polyline(d.s, np.array(c.case.transmitter), rx)
@@ -141,41 +141,55 @@ def edge_terms(c: Compared, d: Difference) -> bool:
     return abs(c.peer.gain[d.s] - expected) < 0.01 * size
 
 
-def _on_ball(c: Compared, d: Difference) -> Ball | None:
-    traced, p = (c.rfsg, d.p) if d.p >= 0 else (c.peer, d.s)
+def _on_ball(c: Compared, p: int) -> Ball | None:
     ball = c.case.things[0]
-    met = p >= 0 and (traced.kind[p] >= 0).any()
-    return ball if met and isinstance(ball, Ball) else None
+    return ball if p >= 0 and (c.rfsg.kind[p] >= 0).any() and isinstance(ball, Ball) else None
+
+
+def _flat(c: Compared, p: int, ball: Ball) -> tuple[complex, float]:
+    """(gain, delay) of one of rfsg's glints were the ball its mesh: nothing where no triangle shows
+    the transmitter, else a plane mirror's over that triangle."""
+    tx, rx = np.array(c.case.transmitter), np.array(c.case.receivers[c.rfsg.rx[p]])
+    points = truth.mirrored_on_facets(ball, tx, rx)
+    if not len(points):
+        return 0j, 0.0
+    point = points[np.linalg.norm(points - c.rfsg.vertex[p, 0], axis=1).argmin()]
+    length = float(np.linalg.norm(point - tx) + np.linalg.norm(rx - point))
+    s1, s2 = _segments(c, p)
+    cosine = np.sqrt((1 + c.rfsg.departure[p] @ c.rfsg.arrival[p]) / 2)
+    curved = waves.divergence(s1, s2, cosine, ball.radius)
+    return complex(c.rfsg.gain[p] / curved / length), length / C
 
 
 def flat_facets(c: Compared, d: Difference) -> bool:
-    """On a ball made of triangles: no triangle is met at the right angle, or one is, and it spreads
-    the wave as a plane mirror does, lambda / 4 pi L. Links follow from their paths."""
+    """The peer has what the triangles of the mesh give as plane mirrors, or nothing where none of
+    them is turned the right way; and its link is the sum of that and rfsg's other paths."""
+    f = c.case.frequency
     if d.quantity == "link power [dB]":
-        rest = [x for x in c.differences if x.rx == d.rx and x is not d]
-        return bool(rest) and all(flat_facets(c, x) for x in rest)
-    ball = _on_ball(c, d)
+        total, balls = 0j, 0
+        for p in np.nonzero(c.rfsg.rx == d.rx)[0].tolist():
+            gain, delay = c.rfsg.gain[p], c.rfsg.delay[p]
+            if ball := _on_ball(c, p):
+                gain, delay = _flat(c, p, ball)
+                balls += 1
+            total += gain * np.exp(-2j * np.pi * np.mod(f * delay, 1.0))
+        there = decibel(np.array(total))
+        return bool(balls and abs(there - c.link_power(c.peer)[d.rx]) < THRESHOLD[d.quantity])
+    ball = _on_ball(c, d.p)
     if ball is None:
         return False
-    tx, rx = np.array(c.case.transmitter), np.array(c.case.receivers[d.rx])
+    gain, delay = _flat(c, d.p, ball)
     if d.quantity == "missing in the peer":
-        return truth.mirroring_facets(ball, tx, rx) == 0
+        return gain == 0
+    if d.s < 0 or gain == 0:
+        return False
     if d.quantity == "power [dB]":
-        s1, s2 = _segments(c, d.p)
-        cosine = np.sqrt((1 - c.rfsg.departure[d.p] @ -c.rfsg.arrival[d.p]) / 2)
-        flat = 1 / (s1 + s2) / waves.divergence(s1, s2, cosine, ball.radius)
-        return bool(abs(d.value - decibel(flat)) < 0.25 * abs(d.value))
-    if d.quantity in ("delay [ns]", "phase [deg]"):
-        shift = abs(c.peer.delay[d.s] - c.rfsg.delay[d.p])
-        return bool(shift * C <= 2 * 2 * sagitta(ball))
-    return False
-
-
-def sagitta(ball: Ball) -> float:
-    """How far the middle of a triangle lies below the ball [m]: side^2 / 6 r, half as much again
-    for the largest triangles of an icosphere."""
-    side_square = 4 * np.pi * ball.radius**2 / ball.facets * 4 / np.sqrt(3)
-    return 1.5 * side_square / (6 * ball.radius)
+        return bool(abs(decibel(c.peer.gain[d.s]) - decibel(gain)) < THRESHOLD[d.quantity])
+    if d.quantity == "delay [ns]":
+        return bool(abs(c.peer.delay[d.s] - delay) < ROUNDINGS * FLOAT32 * delay)
+    share = gain * np.exp(-2j * np.pi * np.mod(f * delay, 1.0))
+    turned = np.degrees(np.angle(c.peer.share(f)[d.s] / share))
+    return bool(abs(turned) < THRESHOLD["phase [deg]"])
 
 
 CAUSES = (
@@ -231,8 +245,9 @@ CAUSES = (
     Cause(
         "flat facets",
         "A mesh's triangle is a plane mirror. Most receivers see themselves in none, the rest in "
-        "one that sends on lambda / (4 pi L), as if the ball were flat; its point lies as far off "
-        "the ball as a triangle cuts in. More triangles make hits no better and no more frequent. "
+        "one that sends on lambda / (4 pi L), as if the ball were flat, by way of a point that lies "
+        "below the ball. The rule looks for that triangle in the same mesh, and asks for its gain, "
+        "delay and phase. More triangles make hits no better and no more frequent. "
         "rfsg's ball has a curvature, one path for each receiver, and the divergence factor of "
         "geometrical optics.",
         flat_facets,

@@ -243,15 +243,15 @@ def sphere(case: Case) -> Traced:
     return _traced(case, case.things, rows)
 
 
-def mirroring_facets(ball: Ball, tx: ndarray, rx: ndarray) -> int:
-    """How many triangles of the ball's mesh show the transmitter to the receiver as a mirror does."""
+def mirrored_on_facets(ball: Ball, tx: ndarray, rx: ndarray) -> ndarray:
+    """[m 3]: where triangles of the ball's mesh show the transmitter to the receiver as mirrors."""
     a, b, c = ball.triangles().transpose(1, 0, 2)
     n = np.cross(b - a, c - a)
     n = n / np.linalg.norm(n, axis=1, keepdims=True)
     height, above = (((p - a) * n).sum(1) for p in (tx, rx))
     point = tx + (height / (height + above))[:, None] * (rx - 2 * above[:, None] * n - tx)
     sides = [(np.cross(q - p, point - p) * n).sum(1) > 0 for p, q in ((a, b), (b, c), (c, a))]
-    return int(((height > 0) & (above > 0) & np.all(sides, 0)).sum())
+    return point[(height > 0) & (above > 0) & np.all(sides, 0)]
 
 
 def _glint(centre: ndarray, radius: float, tx: ndarray, rx: ndarray) -> tuple[ndarray, ndarray]:
