@@ -282,7 +282,8 @@ def _exact(
     ends = tx[bends.tx][:, None], rx[bends.rx][:, None]
     vertices = torch.cat([ends[0], first, line.place, last.flip(1), ends[1]], 1)
     hessian, sine = line.hessian, line.sine
-    floor = wavelength / some.length.reshape(c, k).amin(1) ** 2
+    rim = ~some.straight.reshape(c, k)
+    floor = torch.where(rim, wavelength / some.length.reshape(c, k) ** 2, 0.0).amax(1)
     bent, capped, caustics = _held(hessian, floor)
     spread = sine.prod(1) / (line.length.clamp(min=1e-300).prod(1) * bent)
     which = torch.cat(
@@ -404,7 +405,8 @@ def _held(
 ) -> tuple[Tensor, Bool[Tensor, "c"], Int[Tensor, "c"]]:
     """sqrt|det H|, which were held, and how many directions are maxima (caustics passed).
 
-    No bend below lambda / length^2: the stretch of an edge that acts is never longer than the edge.
+    On a rim no bend below lambda / length^2: the stretch that acts is never longer than the rim. A
+    straight edge has no caustic.
     """
     if hessian.shape[1] == 1:
         bend = hessian[:, 0, 0]
