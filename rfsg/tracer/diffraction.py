@@ -400,6 +400,9 @@ def _solve(hessian: Float[Tensor, "c k k"], right: Float[Tensor, "c k"]) -> Floa
     return torch.where(det[:, None] == 0, 0.0, torch.stack([first, second], 1))
 
 
+TINY = 1e-200  # keeps the root of nothing differentiable
+
+
 def _held(
     hessian: Float[Tensor, "c k k"], floor: Float[Tensor, "c"]
 ) -> tuple[Tensor, Bool[Tensor, "c"], Int[Tensor, "c"]]:
@@ -412,11 +415,12 @@ def _held(
         bend = hessian[:, 0, 0]
         capped = bend.abs() < floor
         return (
-            torch.sqrt(torch.where(capped, floor, bend.abs())),
+            torch.sqrt(torch.where(capped, floor, bend.abs()).clamp(min=TINY)),
             capped,
             ((bend < 0) & ~capped).long(),
         )
     det = hessian[:, 0, 0] * hessian[:, 1, 1] - hessian[:, 0, 1] ** 2
     capped = det <= floor**2
     down = torch.linalg.eigvalsh(hessian.detach()) < 0
-    return torch.sqrt(torch.where(capped, floor**2, det)), capped, (down & ~capped[:, None]).sum(1)
+    held = torch.where(capped, floor**2, det).clamp(min=TINY)
+    return torch.sqrt(held), capped, (down & ~capped[:, None]).sum(1)
