@@ -6,7 +6,7 @@ stands still, so that the answer depends on where the path rests and not on wher
 reciprocity is as exact as float64.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -16,13 +16,14 @@ from rfsg.scene.world import World, unit
 from rfsg.tracer import zone
 from rfsg.tracer.faces import nearest_facets
 from rfsg.tracer.implicit import segments
-from rfsg.tracer.newton import Batch, newton, surfaces_of
+from rfsg.tracer.newton import ROUNDING, Batch, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Status
 from rfsg.tracer.zone import Facets
 
 ON_SURFACE = 1e-7  # of the object's size: a polished vertex is orders closer, an edge passed is not
-SETTLED = 1e-9  # [m] a vertex moves less than this between rounds: phase to 1e-6 rad at 30 GHz
+SETTLED = 1e-11  # [m] a vertex moves less than this between rounds: gains to 1e-9 either way round
+PRECISE = 3  # times ``Quality.refits`` in float64: the last digits come slowly, to few chains
 EDGE_SLACK = 0.03  # [m] how far beyond a planar face's edge a vertex under way may be
 NEARLY = 2e-6  # [m] where float32's own rounding begins: float64 takes over
 PATIENCE = 5  # rounds after which a vertex must keep shrinking its steps, from
@@ -65,7 +66,8 @@ def settle(
     rows = torch.arange(len(batch.x), device=world.device)
     rows = _round(world, batch, state, rows, wavelength, quality, look=True)
     rows = _rounds(world, batch, state, rows, wavelength, quality, torch.float32)
-    _rounds(world, batch, state, rows, wavelength, quality, torch.float64)
+    precise = replace(quality, refits=PRECISE * quality.refits)
+    _rounds(world, batch, state, rows, wavelength, precise, torch.float64)
     return state.x, state.status, state.charts
 
 
@@ -130,7 +132,8 @@ def _round(
     change = moved - part.x
     step = change.norm(dim=-1).amax(-1)
     precise = dtype == torch.float64
-    at_rest = (not look) & settled & (step < (SETTLED if precise else NEARLY))
+    least = SETTLED + ROUNDING * moved.abs().amax((1, 2)) if precise else NEARLY
+    at_rest = (not look) & settled & (step < least)
     lost = _lost(world, part, moved, facets, learned, settled, precise, wavelength)
     restless = (step > RESTLESS * radius.amax(1) * SHRINKING ** (number - PATIENCE)) & (
         number >= PATIENCE
@@ -158,7 +161,8 @@ def _round(
 def _twins(part: Batch, moved: Tensor) -> Tensor:
     """All but one of the chains of one sequence that have come to the same place."""
     cell = torch.round(moved.flatten(1) / SAME).to(torch.int64)
-    key = torch.cat([part.link[:, None], part.which, cell], 1)
+    ends = torch.round(torch.cat([part.tx, part.rx], 1) / SAME).to(torch.int64)
+    key = torch.cat([ends, part.which, cell], 1)
     _, group = torch.unique(key, dim=0, return_inverse=True)
     order = torch.argsort(moved.flatten(1).sum(1), stable=True)  # whose turn it is says nothing
     order = order[torch.argsort(group[order], stable=True)]
