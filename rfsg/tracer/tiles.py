@@ -29,8 +29,8 @@ from rfsg.tracer.march import march
 
 GAUSS = 3.0**-0.5  # the two Gauss-Legendre points on [-1, 1], of equal weight
 SUB = 4  # lines per tile and direction on curved faces
-GRAZING = 0.01  # cosine: a line this flat on a surface stands for almost no area, and stays
 TIE = 1e-6  # relative: points of a lattice lie as near as each other but for rounding
+CUT_OFF = 1e-6  # of the bounds' size
 FINEST = 60  # halvings of a planar tile: a radio a nanometre above a kilometre of ground
 UNBOUNDED = 32.0  # a face without an end reaches this many times the path's own size
 
@@ -186,8 +186,8 @@ def planar_tiles(planes: Planes, grounds: Grounds, cells: Cells, count: int) -> 
 def curved_tiles(world: World, node: int, count: int) -> Tiles:
     """Tiles of a bounded object of any shape: about 6 count^2 of them on a convex one.
 
-    Differentiable in pose and shape: meetings slide along their lines, which keep their place in the
-    bounds.
+    Differentiable in pose and shape. Lines keep their place in the bounds of a shape with a closed
+    form; the points of a learned one move along its normals.
     """
     place, slope, area, key = _meetings(world.scene.nodes[node].body.shape, count, world.device)
     tile, slot, keys, q = _slots(key)
@@ -253,8 +253,9 @@ def _meetings(
         origin = low.expand(len(grid), 3).clone()
         origin[:, across] += (grid + 0.5) * side
         for row, sheet, point in _ends(shape, origin, axis, float((high - low).detach()[axis])):
+            point, grown = (point, 1.0) if shape.convex else _carried(shape, point)
             normal = _normal(shape, point)
-            facing = normal[:, axis]
+            facing = normal[:, axis] if shape.convex else normal[:, axis].detach()
             label = torch.stack(
                 [
                     torch.full_like(row, axis),
@@ -264,7 +265,7 @@ def _meetings(
                 ],
                 1,
             )
-            parts.append((point, normal, side.prod() * facing.abs(), label))
+            parts.append((point, normal, side.prod() * facing.abs() * grown, label))
     point, normal, area, key = (torch.cat(c) for c in zip(*parts, strict=True))
     keep = area > 0
     return point[keep], normal[keep], area[keep], key[keep]
@@ -291,34 +292,35 @@ def _ends(
         fresh[1:] = row[1:] != row[:-1]
         start = torch.where(fresh, number, torch.zeros_like(number))
         sheet = number - (torch.cummax(start, 0).values if len(row) else start)
-    start, along = origin[row], direction[row]
     if shape.convex:
-        enter, leave = shape.interval(start, along)  # of hits alone, with gradients
-        ends = [start + t[:, None] * along for t in (enter, leave)]
-    else:
-        ends = [_slid(shape, start, along, t.to(origin)) for t in (enter, leave)]
-    for point in ends:
-        yield row, sheet, point
+        enter, leave = shape.interval(origin[row], direction[row])  # of hits alone, with gradients
+    for t in (enter, leave):
+        i = torch.arange(len(row), device=row.device)
+        if not shape.convex:  # where its bounds cut a shape off there is no surface
+            i = torch.nonzero((t > CUT_OFF * length) & (t < (1 - CUT_OFF) * length)).squeeze(-1)
+        here = row[i]
+        yield here, sheet[i], origin[here] + t[i].to(origin)[:, None] * direction[here]
 
 
-def _slid(shape: Shape, start: Tensor, along: Tensor, t: Tensor) -> Tensor:
-    """Points at searched roots t, moved on along their lines to the surface, and with it."""
+def _carried(shape: Shape, point: Tensor) -> tuple[Tensor, Tensor]:
+    """Searched points of a marched shape put on the surface, and by what the area about them grows:
+    both move with the surface, along its normal, and area grows by div n on the way."""
     with torch.no_grad():
         for _ in range(2):
-            t = t - _overshoot(shape, start + t[:, None] * along, along)
-    point = start + t[:, None] * along
-    return point - _overshoot(shape, point, along)[:, None] * along
-
-
-def _overshoot(shape: Shape, point: Tensor, along: Tensor) -> Tensor:
-    """f / (df/dt), by one Newton step; nothing where the line grazes."""
-    value = shape.sdf(point)
-    with torch.no_grad():
-        gradient = shape.value_and_gradient(point)[1]
-        slope = (gradient * along).sum(-1)
-        grazing = slope.abs() < GRAZING * gradient.norm(dim=-1).clamp(min=1e-12)
-    step = value / torch.where(grazing, torch.ones_like(slope), slope)
-    return torch.where(grazing, torch.zeros_like(step), step)
+            value, gradient = shape.value_and_gradient(point)
+            slope = (gradient * gradient).sum(-1).clamp(min=1e-12)
+            point = point - (value / slope)[:, None] * gradient
+        one = torch.ones_like(point[:, 0])
+    if not torch.is_grad_enabled():
+        return point, one
+    jet = shape.jet(point)
+    steep = jet.gradient.norm(dim=-1).clamp(min=1e-6).detach()
+    normal, bend = unit(jet.gradient).detach(), jet.hessian.detach()
+    along = torch.einsum("mi,mij,mj->m", normal, bend, normal)
+    spread = (bend.diagonal(dim1=1, dim2=2).sum(-1) - along) / steep
+    move = -shape.sdf(point) / steep
+    move = move - move.detach()
+    return point + move[:, None] * normal, one + move * spread
 
 
 def _normal(shape: Shape, point: Tensor) -> Tensor:
