@@ -363,7 +363,8 @@ class World:
     ) -> Float[Tensor, "m"]:
         """How far solids reach behind plane faces, to a face parallel to them [m]; inf without one.
 
-        A solid of the same medium that is flush with the face behind is more of the same.
+        A solid of the same medium that is flush with the face behind is more of the same. 0 where
+        the face itself lies in or against one: there is no boundary.
         """
         depth = self._depth(which, self.patch(which, point_world))
         node = which
@@ -375,7 +376,16 @@ class World:
             following, more = self._flush(node[reached], far.detach(), normal_world[reached])
             depth = depth.index_add(0, reached, more)
             node = node.index_copy(0, reached, following)
-        return depth
+        return torch.where(self._covered(which, point_world + PROBE * normal_world), 0.0, depth)
+
+    @torch.no_grad()
+    def _covered(self, which: Tensor, point: Tensor) -> Bool[Tensor, "m"]:
+        """Points inside another solid of each node's medium."""
+        covered = torch.zeros_like(which, dtype=torch.bool)
+        for slot in self.adjacent.unbind(1):
+            i = torch.nonzero(slot[which] >= 0).squeeze(-1)
+            covered[i] |= self.sdf(slot[which[i]], point[i]) < 0
+        return covered
 
     def _flush(
         self, which: Tensor, point: Tensor, normal: Tensor
@@ -431,6 +441,7 @@ class World:
 
 
 FLUSH = 1e-8  # [m] faces this near to each other touch
+PROBE = 1e-6  # [m] before a face: what is there
 
 
 def unit(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:

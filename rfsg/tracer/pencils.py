@@ -1,10 +1,12 @@
 """Where refracted paths may lie: pencils of rays through solids, looked up for receivers.
 
 From a source a lattice of rays is sent at one solid and followed through every solid that bends it.
-What leaves is a map from the lattice to the plane across each ray at a receiver. A path is a zero of
-that map: looked for by linear interpolation in every triangle of the lattice. Rays in and out by plane
-faces need no triangle: a sum of distances to planes is convex, so any ray through the same faces leads
-Newton to the only path there is. Complete up to the lattice's spacing; no gradients.
+What leaves is a map from the lattice to the plane across each ray at a receiver, and a path is a zero
+of that map. Looked for by linear interpolation in every triangle of the lattice whose rays meet the
+same smooth faces; and, since a zero may hide beside the last ray that meets a face, wherever a ray
+passes the receiver nearer than its neighbours. Between plane faces that is enough: sums of distances
+to planes are convex, and any ray through the same faces leads Newton to the only path there is.
+Complete up to the lattice's spacing; no gradients.
 """
 
 from collections.abc import Iterator
@@ -123,7 +125,7 @@ def seeds(
                 break
             for part in asked.split(AT_ONCE):
                 mine, targets = of_question[part] - some[0], sights.target[part]
-                for found in (_by_faces, _by_triangles):
+                for found in (_nearest, _by_triangles):
                     q, x, ray = found(world, beams, mine, targets)
                     if len(q):
                         yield Seeds(part[q], beams.which[ray], beams.patch[ray], x)
@@ -259,25 +261,32 @@ def _miss(beams: Beams, ray: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     return target - o - along[:, None] * d, along > 0
 
 
-def _by_faces(
+def _nearest(
     world: World, beams: Beams, lattice: Tensor, target: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The nearest ray to every target through each sequence of plane faces."""
-    face, flat = _faces(world, beams)
-    i = torch.nonzero(flat).squeeze(-1)
-    q, ray = _pairs(lattice, beams.lattice[i])
-    ray = i[ray]
-    if not len(q):
-        return q, beams.x[ray], ray
-    away, _ = _miss(beams, ray, target[q])
+    """Rays that pass targets nearer than all their neighbours on the lattice through the same faces."""
+    face, _ = _faces(world, beams)
     _, sequence = torch.unique(face, dim=0, return_inverse=True)
-    code = q * (int(sequence.max()) + 1) + sequence[ray]
-    order = torch.argsort((away * away).sum(-1), stable=True)
-    order = order[torch.argsort(code[order], stable=True)]
-    first = torch.ones_like(order, dtype=torch.bool)
-    first[1:] = code[order][1:] != code[order][:-1]
-    best = order[first]
-    return q[best], beams.x[ray[best]], ray[best]
+    row = _grid(beams, int(lattice.max()) + 1)[lattice]
+    there = row >= 0
+    ray, side = row.clamp(min=0), LATTICE + 2
+    aim = target[:, None, None].expand(*row.shape, 3)
+    away, ahead = _miss(beams, ray.reshape(-1), aim.reshape(-1, 3))
+    square = (away * away).sum(-1).reshape(row.shape)
+    there &= ahead.reshape(row.shape)
+    pad = torch.nn.functional.pad
+    square, code = pad(square, (1, 1, 1, 1)), torch.where(there, sequence[ray], -1)
+    code = pad(code, (1, 1, 1, 1), value=-1)
+    middle = slice(1, side - 1)
+    least = there
+    for i in range(3):
+        for j in range(3):
+            beside = (slice(None), slice(i, i + LATTICE), slice(j, j + LATTICE))
+            nearer = square[beside] < square[:, middle, middle]
+            least = least & ~(nearer & (code[beside] == code[:, middle, middle]))
+    q, i, j = torch.nonzero(least, as_tuple=True)
+    best = row[q, i, j]
+    return q, beams.x[best], best
 
 
 def _by_triangles(
@@ -318,14 +327,18 @@ def _zero(miss: Float[Tensor, "t 3 2"]) -> tuple[Float[Tensor, "t 3"], Bool[Tens
     return torch.stack([1.0 - w1 - w2, w1, w2], 1), regular | met
 
 
+def _grid(beams: Beams, count: int) -> Int[Tensor, "l n n"]:
+    """The row in ``beams`` of every ray of the lattices; -1 where it is not there."""
+    row = torch.full((count * LATTICE**2,), -1, dtype=torch.int64, device=beams.lattice.device)
+    mine = beams.lattice < count
+    number = torch.arange(len(beams.lattice), device=row.device)
+    row[(beams.lattice * LATTICE**2 + beams.place)[mine]] = number[mine]
+    return row.reshape(count, LATTICE, LATTICE)
+
+
 def _triangles(beams: Beams) -> Int[Tensor, "t 3"]:
     """Triangles of the lattices of which all three rays are there, as rows of ``beams``."""
-    count = int(beams.lattice.max()) + 1
-    row = torch.full((count * LATTICE**2,), -1, dtype=torch.int64, device=beams.lattice.device)
-    row[beams.lattice * LATTICE**2 + beams.place] = torch.arange(
-        len(beams.lattice), device=row.device
-    )
-    grid = row.reshape(count, LATTICE, LATTICE)
+    grid = _grid(beams, int(beams.lattice.max()) + 1)
     a, b = grid[:, :-1, :-1], grid[:, 1:, :-1]
     c, d = grid[:, :-1, 1:], grid[:, 1:, 1:]
     corners = torch.cat([torch.stack(t, -1).reshape(-1, 3) for t in ((a, b, c), (d, b, c))])
