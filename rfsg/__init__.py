@@ -29,41 +29,56 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rfsg.objects.body import Body as Body
+    from rfsg.scene.arrays import Array as Array
+    from rfsg.scene.patterns import Pattern as Pattern
     from rfsg.scene.pose import Pose as Pose
     from rfsg.scene.radios import Radio as Radio
     from rfsg.scene.scene import Node as Node
     from rfsg.scene.scene import Scene as Scene
     from rfsg.scene.scene import SceneError as SceneError
+    from rfsg.tracer.mimo import capacity as capacity
+    from rfsg.tracer.mimo import mimo as mimo
     from rfsg.tracer.plan import Quality as Quality
     from rfsg.tracer.radiomap import radio_map as radio_map
+    from rfsg.tracer.radiomap import radio_map_on as radio_map_on
     from rfsg.tracer.simulate import Result as Result
     from rfsg.tracer.simulate import simulate as simulate
 
 __version__ = "0.1.0"
 
 _HOME = {
+    "Array": "rfsg.scene.arrays",
     "Body": "rfsg.objects.body",
     "Node": "rfsg.scene.scene",
+    "Pattern": "rfsg.scene.patterns",
     "Pose": "rfsg.scene.pose",
     "Quality": "rfsg.tracer.plan",
     "Radio": "rfsg.scene.radios",
     "Result": "rfsg.tracer.simulate",
     "Scene": "rfsg.scene.scene",
     "SceneError": "rfsg.scene.scene",
+    "capacity": "rfsg.tracer.mimo",
+    "mimo": "rfsg.tracer.mimo",
     "radio_map": "rfsg.tracer.radiomap",
+    "radio_map_on": "rfsg.tracer.radiomap",
     "simulate": "rfsg.tracer.simulate",
 }
 
 __all__ = [
+    "Array",
     "Body",
     "Node",
+    "Pattern",
     "Pose",
     "Quality",
     "Radio",
     "Result",
     "Scene",
     "SceneError",
+    "capacity",
+    "mimo",
     "radio_map",
+    "radio_map_on",
     "simulate",
 ]
 

@@ -235,7 +235,9 @@ def simulate(
         report.write_json(report.report(result, **asked), folder / "report.json")
         _draw_run(edited, result, chosen, folder, title=scene.name)
     _print_links(result)
-    for warning in result.warnings:
+    from rfsg.tracer.mimo import plane_wave_warnings
+
+    for warning in (*result.warnings, *plane_wave_warnings(result)):
         note(warning)
     print_files(out, ("links.csv", "paths.csv", "channel.npz", "report.json"))
     print_files(out, ("scene.png", "pdp.png"))
