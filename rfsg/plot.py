@@ -219,7 +219,7 @@ def _surface_figure(
 ) -> tuple[Figure, Any]:
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
     axes = figure.add_subplot(projection="3d")
-    triangles = _numpy(cells.triangle)
+    triangles, value = _numpy(cells.triangle), value[_numpy(cells.owner)]
     colours = look["cmap"](look["norm"](value.filled(0.0)))
     colours[np.ma.getmaskarray(value)] = to_rgba(_NOTHING)
     axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors="none"))

@@ -260,12 +260,14 @@ def write_map(
     best_server [*c], -1 for none; tx_paths, frequency, bandwidth and noise_figure_db of the SINR.
 
     On a plane *c is [ny, nx]: cell [m], x [nx] and y [ny], the cells' middles in the plane, which
-    stand at origin + x u + y v in the world. On a surface it is [c]: triangle [c, 3, 3], point and
-    normal [c, 3], area [c].
+    stand at origin + x u + y v in the world. On a surface it is [c]: triangle [k, 3, 3] and whose each
+    is, owner [k]; point and normal [c, 3], area [c].
     """
     cells = radio_map.cells
     names = (
-        ("x", "y", "cell") if hasattr(cells, "plane") else ("triangle", "point", "normal", "area")
+        ("x", "y", "cell")
+        if hasattr(cells, "plane")
+        else ("triangle", "owner", "point", "normal", "area")
     )
     arrays: dict[str, Any] = {name: _numpy(getattr(cells, name)) for name in names}
     if hasattr(cells, "plane"):

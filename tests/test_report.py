@@ -152,7 +152,8 @@ def test_a_map_file_places_its_cells_and_holds_every_metric(small_run, tmp_path)
     on = RadioMap(scene, 1e9, patches, gain, 0 * gain, "paths")
     report.write_map(on, tmp_path / "on.npz")
     with np.load(tmp_path / "on.npz", allow_pickle=False) as stored:
-        assert stored["triangle"].shape == (len(patches.point), 3, 3)
+        assert stored["triangle"].shape == (len(stored["owner"]), 3, 3)
+        assert stored["owner"].max() == len(patches.point) - 1
         assert stored["area"] == pytest.approx(patches.area.numpy())
 
 

@@ -1,7 +1,8 @@
 """Where a radio map is read: square cells on a plane of any orientation.
 
 Cells, here and in ``patches``, say where they are (``point``), how large (``area``), and for maps by
-rays which rays meet which sub-cell (``meet``): the spread of power within a cell is read from those.
+rays which rays meet which sub-cell (``meet``), with whose each is (``owner``) and how large
+(``subarea``): the spread of power within a cell is read from them.
 """
 
 import math
@@ -42,7 +43,6 @@ class Grid:
     cell: float
     x: Float[Tensor, "nx"]
     y: Float[Tensor, "ny"]
-    subcells = SIDE * SIDE
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -57,6 +57,14 @@ class Grid:
     @property
     def area(self) -> Float[Tensor, "c"]:
         return torch.full((len(self.x) * len(self.y),), self.cell**2, dtype=torch.float64)
+
+    @property
+    def owner(self) -> Int[Tensor, "s"]:
+        return torch.arange(len(self.x) * len(self.y)).repeat_interleave(SIDE * SIDE)
+
+    @property
+    def subarea(self) -> Float[Tensor, "s"]:
+        return torch.full_like(self.owner, (self.cell / SIDE) ** 2, dtype=torch.float64)
 
     def meet(self, rays: Rays) -> Meeting:
         """Rays through the plane, each in one sub-cell at most."""
@@ -77,7 +85,7 @@ class Grid:
         return Meeting(
             ray,
             t[ray],
-            cell * self.subcells + (row % SIDE) * SIDE + column % SIDE,
+            (cell * SIDE + row % SIDE) * SIDE + column % SIDE,
             slope[ray].abs(),
         )
 

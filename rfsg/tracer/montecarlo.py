@@ -64,15 +64,19 @@ class Flight:
     toll: Float[Tensor, "m"]
 
     def power_at(self, ray: Int[Tensor, "k"], distance: Float[Tensor, "k"]) -> Float[Tensor, "k"]:
-        """Weight of rays at distances along them, everything left behind paid."""
+        """Weight of rays at distances along them, everything left behind paid.
+
+        What lets nothing through is paid where it is entered: it is dark inside.
+        """
         paid = torch.zeros_like(distance)
+        due = torch.where(torch.isinf(self.toll), self.inside.enter, self.inside.leave)
         count = torch.bincount(self.inside.ray, minlength=len(self.weight))
         first = torch.cumsum(count, 0) - count
         for k in range(int(count.max()) if len(self.inside.ray) else 0):
             has = torch.nonzero(count[ray] > k).squeeze(-1)
             i = first[ray[has]] + k
-            left = self.inside.leave[i] <= distance[has]
-            paid[has] += torch.where(left, self.toll[i], torch.zeros_like(self.toll[i]))
+            behind = due[i] <= distance[has]
+            paid[has] += torch.where(behind, self.toll[i], torch.zeros_like(self.toll[i]))
         alive = (distance <= self.end[ray]) & torch.isfinite(paid)
         return torch.where(alive, self.weight[ray] * torch.exp(-paid), torch.zeros_like(paid))
 

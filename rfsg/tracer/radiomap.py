@@ -1,10 +1,10 @@
 """Radio maps: power over the cells of a plane of any orientation, or of a surface.
 
 ``rays``: the Monte Carlo estimator of ``montecarlo``, every branch followed: what crosses a cell,
-over its area. It follows reflection and penetration. ``paths``: the exact path solver at the cells'
-middles, with all that the quality asks for. The rays' map is the mean over a cell, the solver's a
-point of it, so the reported error holds both the scatter between turned lattices and the spread of
-power within the cell.
+over its area. It follows reflection, mirror-like and diffuse, and penetration. ``paths``: the exact
+path solver at a point of each cell, with all that the quality asks for. The rays' map is the mean
+over a cell, the solver's a point of it, so the reported error holds both the scatter between turned
+lattices and the spread of power within the cell.
 
 Power is summed over paths without phase, as it is where phases average out over a cell.
 """
@@ -220,21 +220,19 @@ def _by_rays(question: _Question, cells: Grid | Patches) -> RadioMap:
     world, quality, f = question.world, question.quality, question.frequency
     scene, proxies = world.scene, Proxies(world)
     tx = positions(scene.transmitters, world.device)
-    fine = (cells.area.to(world.device) / cells.subcells).repeat_interleave(cells.subcells)
+    owner, area = cells.owner.to(world.device), cells.subarea.to(world.device)
     aperture = float((SPEED_OF_LIGHT / f) ** 2) / (4 * math.pi)
-    gain = torch.zeros(len(tx), len(fine) // cells.subcells, dtype=torch.float64, device=f.device)
+    gain = torch.zeros(len(tx), math.prod(cells.shape), dtype=torch.float64, device=f.device)
     error = torch.full_like(gain, torch.inf)
     for t, radio in enumerate(scene.transmitters):
-        total = torch.zeros(COPIES, len(fine), dtype=torch.float64, device=world.device)
+        total = torch.zeros(COPIES, len(area), dtype=torch.float64, device=world.device)
         for copy, flight in flights(
             world, proxies, radio, tx[t], f, quality, "enumerate", question.seed
         ):
             met = cells.meet(flight.rays)
             share = flight.power_at(met.ray, met.distance) / met.cosine
             total[copy].index_add_(0, met.subcell, share)
-        density = (total * aperture / fine).reshape(COPIES, -1, cells.subcells)
-        gain[t], error[t] = _summary(density)
-    plan = make_plan(world, quality)
+        gain[t], error[t] = _summary(total * aperture / area, area, owner, gain.shape[1])
     return RadioMap(
         scene,
         float(f[0]),
@@ -242,25 +240,41 @@ def _by_rays(question: _Question, cells: Grid | Patches) -> RadioMap:
         gain.reshape(-1, *cells.shape),
         error.reshape(-1, *cells.shape),
         "rays",
-        (f"{quality.map_rays} rays from each transmitter, {quality.depth} reflections at most",),
-        (*plan.left_out, *_NOT_BY_RAYS),
+        _by_rays_in_words(quality),
+        (*make_plan(world, quality).left_out, _NOT_BY_RAYS),
         scene.warnings,
     )
 
 
 _NOT_BY_RAYS = (
-    "diffraction, diffuse scattering, bending inside solids and polarisation: a map by rays follows "
-    "straight rays with mirror reflections; a map by paths follows what the quality asks for",
+    "diffraction, bending inside solids and polarisation: rays of a map go straight on or are sent "
+    "back by surfaces; a map by paths follows what the quality asks for"
 )
 
 
-def _summary(density: Float[Tensor, "n c s"]) -> tuple[Tensor, Tensor]:
+def _by_rays_in_words(quality: Quality) -> tuple[str, ...]:
+    scattered = ", diffuse once" if quality.diffuse else ""
+    return (
+        f"{quality.map_rays} rays from each transmitter with {quality.depth} reflections at most"
+        f"{scattered}, and what they go through",
+    )
+
+
+def _summary(
+    density: Float[Tensor, "n s"], area: Float[Tensor, "s"], owner: Int[Tensor, "s"], count: int
+) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
     """Mean gain of cells, and one standard deviation in dB of scatter and spread together."""
-    mean = density.mean((0, 2))
-    scatter = density.mean(2).std(0) / COPIES**0.5
+    zero = torch.zeros(count, dtype=area.dtype, device=area.device)
+    share = area / zero.index_add(0, owner, area)[owner]
+
+    def over_cells(value: Float[Tensor, "s"]) -> Float[Tensor, "c"]:
+        return zero.index_add(0, owner, share * value)
+
+    mean = over_cells(density.mean(0))
+    scatter = torch.stack([over_cells(copy) for copy in density]).std(0) / COPIES**0.5
     # the spread between sub-cells, less what their own scatter already explains
-    noise = (density.var(0) / COPIES).mean(-1)
-    spread = torch.clamp(density.mean(0).var(-1) - noise, min=0.0)
+    noise = density.var(0) / COPIES
+    spread = over_cells((density.mean(0) - mean[owner]) ** 2 - noise).clamp(min=0.0)
     deviation = torch.sqrt(scatter**2 + spread)
     safe = torch.where(mean > 0, mean, torch.ones_like(mean))
     error = 10.0 * torch.log10(1.0 + deviation / safe)

@@ -182,12 +182,14 @@ def test_patches_of_a_box_are_its_faces_just_outside():
     patches = patches_of(World(Scene((node,))), "/box", 0.3, 0.01)
     assert float(patches.area.sum()) == pytest.approx(8 * (0.15 + 0.1 + 0.06), rel=1e-12)
     side = (patches.triangle.roll(-1, 1) - patches.triangle).norm(dim=-1)
-    assert float(side.max()) <= 0.3 + 1e-9
+    assert float(side.max()) <= 0.15 + 1e-9  # four triangles to a cell
+    assert torch.bincount(patches.owner).unique().tolist() == [4]
+    middle = patches.triangle.reshape(-1, 12, 3).mean(1)
+    assert torch.allclose(middle, patches.point)
     inner = node.pose.point_object(patches.point)
     beyond = inner.abs() - node.body.shape.half_size
     assert torch.allclose(beyond.amax(-1), torch.tensor(0.01).double(), atol=1e-12)
     assert bool(((inner * node.pose.direction_object(patches.normal)).sum(-1) > 0).all())
-    assert torch.allclose(patches.triangle.mean(1), patches.point)
 
 
 @pytest.mark.parametrize(
@@ -198,11 +200,30 @@ def test_patches_of_a_curved_object_stand_off_the_true_surface(shape, area):
     mirrored = Pose(torch.diag(vector(1.0, -1.0, 1.0)), vector(1.0, 2.0, 3.0), vector(2.0)[0])
     scene = Scene((Node("/thing", Body(shape, Conductor()), mirrored),))
     world = World(scene)
-    patches = patches_of(world, "/thing", 0.4, 0.05)
+    patches = patches_of(world, "/thing", 0.3, 0.05)
     which = torch.zeros(len(patches.point), dtype=torch.int64)
     assert torch.allclose(world.sdf(which, patches.point), torch.tensor(0.05).double(), atol=1e-6)
     # lifted faces are those of the surface; chords lose a little of it
     assert float(patches.area.sum()) == pytest.approx(4.0 * area, rel=0.05)
+    away = patches.triangle.mean(1) - patches.point[patches.owner]
+    assert float(away.norm(dim=-1).max()) < 0.3 * 3**0.5 + 0.1  # a cell lies in one cube
+    across = (away * patches.normal[patches.owner]).sum(-1).abs()
+    assert float(across.max()) < 0.3
+    assert bool((torch.bincount(patches.owner) > 0).all())
+
+
+def test_patches_move_with_their_object():
+    """Rigid motion: the same cells, elsewhere."""
+    pose = Pose(plane_through((7.0, 8.0, 9.0), (1.0, 0.2, 0.3), (0.0, 1.0, 0.6)).rotation,
+                vector(7.0, 8.0, 9.0), vector(1.0)[0])  # fmt: skip
+    for shape in (Sphere(0.4), Cylinder(0.2, 0.5), room().nodes[0].body.shape):
+        here, there = (
+            patches_of(World(Scene((Node("/a", Body(shape, Conductor()), p),))), "/a", 0.5, 0.02)
+            for p in (Pose.identity(), pose)
+        )
+        assert torch.equal(here.owner, there.owner)
+        assert torch.allclose(pose.point_world(here.triangle), there.triangle, atol=1e-12)
+        assert torch.allclose(pose.point_world(here.point), there.point, atol=1e-9)
 
 
 def test_a_map_on_an_object_is_a_simulation_at_its_points():
@@ -238,8 +259,8 @@ def test_a_map_on_a_mesh_by_rays_agrees_with_paths_within_its_error():
 def test_every_ray_is_counted_once_on_a_closed_surface():
     """An isotropic source inside: what the patches collect is all that it sends."""
     node = box_node("/box", (0.2, 0.1, 0.3), (1.0, 0.8, 0.6))
-    patches = patches_of(World(Scene((node,))), "/box", 0.5, 0.0)
-    mesh = (patches.triangle.reshape(-1, 3), torch.arange(3 * len(patches.area)).reshape(-1, 3))
+    patches = patches_of(World(Scene((node,))), "/box", 1.0, 0.0)
+    mesh = (patches.triangle.reshape(-1, 3), torch.arange(3 * len(patches.owner)).reshape(-1, 3))
     alone = Scene((), (radio("/tx", 0.0, 0.0, 0.0),))
     cells = patches_from(*mesh, 0.5, 0.0)
     found = radio_map_on(alone, mesh, 2.4e9, cell=0.5, offset=0.0, quality=FEWER, method="rays")
@@ -248,6 +269,16 @@ def test_every_ray_is_counted_once_on_a_closed_surface():
     aperture = (299_792_458.0 / 2.4e9) ** 2 / (4 * math.pi)
     # each patch's own mean cosine is not quite that of its middle
     assert float(flux) / aperture == pytest.approx(1.0, rel=0.02)
+
+
+def test_it_is_dark_inside_metal_and_lit_before_it():
+    """A map by rays through a metal box: nothing within, as by paths."""
+    metal = box_node("/box", (3.0, 2.0, 1.2), (0.9, 0.9, 0.5), Conductor())
+    scene = Scene((metal,), (radio("/tx", 0.5, 2.0, 2.2),))
+    options = dict(cell=1.0, bounds=(1.5, 1.5, 3.5, 2.5), quality=FEWER)
+    rays, paths = (radio_map(scene, 2.4e9, method=m, **options) for m in ("rays", "paths"))
+    assert rays.path_gain[0, 0, 1] == paths.path_gain[0, 0, 1] == 0.0
+    assert bool((rays.path_gain[0, :, 0] > 0).all())
 
 
 def test_empty_and_wrong_questions():
