@@ -16,8 +16,8 @@ The phase of a tile is random and a matter of its number and of ``Quality.phase_
 sees speckle, and the mean over seeds is the sum of the tiles' powers (``channel.power``). Field vectors
 are reflected as by a mirror, with Fresnel's coefficients at theta_i, and turned from the mirror
 direction to the tile's by the least rotation; the share K_x of their power leaves turned by 90 degrees,
-with a phase of its own (K_x after Degli-Esposti et al. 2011, "Analysis and modeling on co- and
-cross-polarized urban radio propagation for dual-polarized MIMO wireless systems").
+with a phase of its own (K_x as in the primer on electromagnetics of Sionna RT, which keeps the arriving
+polarisation where this one reflects and turns it).
 """
 
 import math

@@ -2,8 +2,7 @@
 
 The effective roughness model of Degli-Esposti, Fuschini, Vitucci and Falciasecca, "Measurement and
 modelling of scattering from buildings", IEEE Trans. Antennas Propag. 55(1), 2007. A share S^2 of the
-reflected power |R|^2 leaves diffusely and the mirror keeps 1 - S^2 (their Eq. 4); the diffuse power
-leaves by a lobe p [1/sr] about the outward normal n:
+reflected power |R|^2 leaves diffusely and the mirror keeps 1 - S^2; the diffuse power leaves by a lobe p [1/sr] about the outward normal n:
 
     lambertian      p = cos(theta_s) / pi
     directive       p = ((1 + cos psi_R) / 2)^alpha_R / F
@@ -16,8 +15,8 @@ the integral of p over the hemisphere 1 at every incidence: L F_alphaR + (1 - L)
     I_k = 2 pi / (k + 1) * { 1 (k even);  cos(theta_i) sum_{w <= (k-1)/2} C(2w, w) (sin(theta_i) / 2)^2w }.
 
 Only the Lambertian lobe is reciprocal (Vitucci et al., "A reciprocal heuristic model for diffuse
-scattering from walls and surfaces", IEEE Trans. Antennas Propag. 71(7), 2023), and that only where
-|R| is the same at both angles.
+scattering from walls and surfaces", 2023, arXiv:2209.12685), and that only where |R| is the same at
+both angles.
 """
 
 import math
