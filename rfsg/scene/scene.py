@@ -39,7 +39,7 @@ class Scene:
     receivers: tuple[Radio, ...] = ()
     frequency: float | None = None  # [Hz], the stage's default
     warnings: tuple[str, ...] = ()
-    source: Any = field(default=None, compare=False, repr=False)  # USD origin; scene/usd.py only
+    source: Any = field(default=None, compare=False, repr=False)  # USD origin; scene/usd only
 
     @staticmethod
     def from_usd(path: str | Path, **options: Any) -> "Scene":

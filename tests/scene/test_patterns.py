@@ -487,7 +487,7 @@ def test_usd_confines_pattern_files_and_names_their_faults(scene_file, tmp_path,
 
 
 def test_usd_bounds_pattern_files(scene_file, tmp_path, monkeypatch):
-    monkeypatch.setattr(usd, "MAX_PATTERN_BYTES", 10)
+    monkeypatch.setattr(usd.radios, "MAX_PATTERN_BYTES", 10)
     written(tmp_path, csv_text(flat_rows()))
     with pytest.raises(SceneError, match="patternFile './antenna.csv' take .*; the limit is 10"):
         Scene.from_usd(scene_file(radio_text("./antenna.csv")))

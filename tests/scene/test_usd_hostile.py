@@ -174,7 +174,7 @@ def test_braces_in_text_and_comments_are_not_nesting(scene_file, monkeypatch):
 
 
 def test_more_prims_than_the_limit(scene_file, monkeypatch):
-    monkeypatch.setattr(usd, "MAX_PRIMS", 3)
+    monkeypatch.setattr(usd.reading, "MAX_PRIMS", 3)
     assert any("more than 3 prims" in f for f in faults_of(scene_file(cube("A") + cube("B"))))
 
 

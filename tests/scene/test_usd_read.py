@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 
-from rfsg.scene import usd
+from rfsg.scene import fields, usd
 from rfsg.scene.scene import Scene, SceneError
 from tests.scene.scene_text import cube, known
 
@@ -374,13 +374,13 @@ def test_schema_is_registered_and_says_what_the_table_says():
     from pxr import Usd
 
     registry = Usd.SchemaRegistry()
-    tables = {"NeuralObject": usd.NEURAL, "Material": usd.MATERIAL, "Radio": usd.RADIO}
+    tables = {"NeuralObject": fields.NEURAL, "Material": fields.MATERIAL, "Radio": fields.RADIO}
     for name, table in tables.items():
         definition = registry.FindAppliedAPIPrimDefinition(f"Rfsg{name}API")
         assert set(definition.GetPropertyNames()) == {f.name for f in table}
         for item in table:
             attribute = definition.GetAttributeDefinition(item.name)
-            assert attribute.GetTypeName() == usd.USD_TYPES[item.kind]
+            assert attribute.GetTypeName() == usd.attributes.USD_TYPES[item.kind]
             assert attribute.GetFallbackValue() == item.fallback
             assert tuple(attribute.GetMetadata("allowedTokens") or ()) == item.tokens
 

@@ -1,0 +1,22 @@
+"""USD <-> Scene: the only door to pxr.
+
+Attributes are the truth (``rfsg:neural:*``, ``rfsg:material:*``, ``rfsg:radio:*``, ``rfsg:shape``,
+``rfsg:velocity``, ``rfsg:frequencyHz``); the API schemas of ``rfsg/scene/schema/`` are a
+courtesy to other programs, and the fallbacks are the tables of ``rfsg.scene.fields``. All rfsg
+values are SI, whatever metersPerUnit says: thickness in metres, velocity in m/s along the stage's
+axes. The loader converts places and sizes to metres and turns the stage so that z is up.
+
+Where USD leaves room: visibility does not make a thing vanish for waves (``active = false`` does);
+purposes guide and proxy do; a material bound on an ancestor holds for all below it; the numbers of
+a neural object are metres of the layer that brought its weights in.
+
+``reading`` walks a stage and ``writing`` makes one; ``objects`` does both for one asset. What each
+kind of thing is in USD, read and written, is in ``shapes``, ``materials``, ``radios`` and
+``placements``. Below them: ``attributes``, ``composition``, ``layers``, ``faults``.
+"""
+
+from rfsg.scene.usd.objects import AssetRecord, read_asset, write_asset
+from rfsg.scene.usd.reading import check, read
+from rfsg.scene.usd.writing import write
+
+__all__ = ["AssetRecord", "check", "read", "read_asset", "write", "write_asset"]
