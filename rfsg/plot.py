@@ -222,7 +222,9 @@ def _surface_figure(
     triangles, value = _numpy(cells.triangle), value[_numpy(cells.owner)]
     colours = look["cmap"](look["norm"](value.filled(0.0)))
     colours[np.ma.getmaskarray(value)] = to_rgba(_NOTHING)
-    axes.add_collection3d(Poly3DCollection(triangles, facecolors=colours, edgecolors="none"))
+    # edges of the same colour close the seams between triangles
+    look = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.4}
+    axes.add_collection3d(Poly3DCollection(triangles, **look))
     corner = triangles.reshape(-1, 3)
     _frame_space(axes, corner.min(axis=0), corner.max(axis=0))
     return figure, axes
