@@ -2,7 +2,8 @@
 
 The effective roughness model of Degli-Esposti, Fuschini, Vitucci and Falciasecca, "Measurement and
 modelling of scattering from buildings", IEEE Trans. Antennas Propag. 55(1), 2007. A share S^2 of the
-reflected power |R|^2 leaves diffusely and the mirror keeps 1 - S^2; the diffuse power leaves by a lobe p [1/sr] about the outward normal n:
+reflected power |R|^2 leaves diffusely and the mirror keeps 1 - S^2; the diffuse power leaves by a lobe
+p [1/sr] about the outward normal n:
 
     lambertian      p = cos(theta_s) / pi
     directive       p = ((1 + cos psi_R) / 2)^alpha_R / F
