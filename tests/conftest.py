@@ -60,8 +60,6 @@ def small_run():
     Link 0 has line of sight and a reflection from the box; link 1 goes through the sphere; one more
     path is blocked. Everything that draws or writes a result can be tried on it, without a tracer.
     """
-    from types import SimpleNamespace
-
     import torch
 
     from rfsg.objects.body import Body
@@ -70,10 +68,10 @@ def small_run():
     from rfsg.scene.pose import Pose
     from rfsg.scene.radios import Radio
     from rfsg.scene.scene import Node, Scene
-    from rfsg.tracer.channel import links
     from rfsg.tracer.launch import SearchReport
     from rfsg.tracer.plan import Plan, Quality
-    from rfsg.tracer.records import Channel, Paths
+    from rfsg.tracer.records import Chains, Channel, Paths
+    from rfsg.tracer.simulate import Result
 
     def real(values):
         return torch.tensor(values, dtype=torch.float64)
@@ -122,15 +120,17 @@ def small_run():
         crossed=torch.tensor([[2, 1, 0], [3, 1, 0]]),
         blocked=torch.tensor([False, False, False, True]),
     )
-    return SimpleNamespace(
-        scene=scene,
-        paths=paths,
-        channel=channel,
-        plan=Plan(Quality(), ("reflection",), ("diffraction: no edges asked for",)),
+    none = torch.zeros(0, dtype=torch.int64)
+    chains = Chains(none, none, none.reshape(0, 1), none.reshape(0, 1), real([]).reshape(0, 1, 3))
+    return Result(
+        scene,
+        channel.frequency,
+        paths,
+        channel,
+        chains,
+        Plan(Quality(), ("reflection",), ("diffraction: no edges asked for",)),
+        SearchReport(rays=100),
         status_counts={"OK": 3, "OPAQUE": 1},
-        search=SearchReport(rays=100),
         seconds={"search": 0.1, "solve": 0.2},
-        warnings=["a warning"],
-        links=lambda: links(scene, paths, channel),
-        path_gain=lambda: real([[[4e-5], [2.8e-5]]]),
+        warnings=("a warning",),
     )
