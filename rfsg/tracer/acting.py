@@ -60,6 +60,24 @@ def scalar(pair: Complex[Tensor, "*b 2"]) -> Complex[Tensor, "*b"]:
 DARK = 1e-60  # power of -600 dB: nothing
 
 
+def crossing_normal(
+    direction: Float[Tensor, "m 3"],
+    normal_start: Float[Tensor, "m 3"],
+    normal_end: Float[Tensor, "m 3"],
+) -> Float[Tensor, "m 3"]:
+    """The normal whose plane of incidence a whole crossing is given: the mean of entry and exit.
+
+    Of parallel faces they are opposed, of a ball's chord they lie on one side of the ray: what they
+    have across the ray adds up, not what they have along it. The same backwards.
+    """
+    first, last = (
+        torch.linalg.cross(direction, normal_start),
+        torch.linalg.cross(direction, normal_end),
+    )
+    opposed = ((first * last).sum(-1, keepdim=True) <= 0).to(direction)
+    return unit(normal_start + (1.0 - 2.0 * opposed) * normal_end)
+
+
 def dyad_of(
     pair: Complex[Tensor, "m f 2"],
     incoming: Float[Tensor, "m 3"],

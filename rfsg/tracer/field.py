@@ -18,8 +18,8 @@ from torch import Tensor
 
 from rfsg.scene.antennas import basis
 from rfsg.scene.radios import Radio, amplitude, field_components
-from rfsg.scene.world import World, unit
-from rfsg.tracer.acting import Acting, dyad_of, scalar
+from rfsg.scene.world import World
+from rfsg.tracer.acting import Acting, crossing_normal, dyad_of, scalar
 from rfsg.tracer.edges import Edges
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.implicit import segments
@@ -154,8 +154,8 @@ def _jones(
 def _through(
     field: Tensor, through: Passages, i: Tensor, u: Tensor, transmission: Tensor
 ) -> Tensor:
-    path = through.path[i]
-    n = unit(through.crossing.normal_start[i] - through.crossing.normal_end[i])
+    path, crossing = through.path[i], through.crossing
+    n = crossing_normal(u[path], crossing.normal_start[i], crossing.normal_end[i])
     bent = dyad_of(transmission[i], u[path], u[path], n) @ field[path]
     return field.index_copy(0, path, bent)
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from rfsg.objects.contract import Contact, Crossing
 from rfsg.objects.physics import utd
 from rfsg.scene.world import unit
-from rfsg.tracer.acting import Acting, scalar
+from rfsg.tracer.acting import Acting, crossing_normal, scalar
 from rfsg.tracer.edges import Edges, along_face
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.records import Act
@@ -103,7 +103,7 @@ def _weights(at: Acting, which: Tensor, w: _Wedge, polarised: bool) -> Weights:
     step = 1e-6 * torch.minimum(w.s_in, w.s_out)[:, None] * ahead
     corner = Crossing(w.point - step, w.point + step, enter, leave)
     pair = at.world.transmission(which, corner, at.frequency)
-    turn = _angle_between(w.frame(ahead, ahead), ahead, unit(enter - leave))
+    turn = _angle_between(w.frame(ahead, ahead), ahead, crossing_normal(ahead, enter, leave))
     return reflected[0], reflected[1], _turned(pair, turn, True) if polarised else _both(pair)
 
 
