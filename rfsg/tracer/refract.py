@@ -37,6 +37,7 @@ from rfsg.tracer.records import Act, Found, Paths, Rays, Status, runs_in
 from rfsg.tracer.solve import GRAZING, duplicates, implicit_step, on_faces
 
 STEPS = 4  # of the index, from 1 to what it is
+ROUNDS = 6  # of Newton's method at each but the last: near enough for the next
 MOST_SIGHTS = 20_000  # lattices of rays: some minutes' worth
 SAME = 1e-5  # of the solids' size: paths nearer to each other are one
 SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
@@ -150,12 +151,12 @@ def _bent(bender: Bender, paths: Paths) -> tuple[Bool[Tensor, "p"], list[Paths],
         runs = runs.take(~parallel(bender.world, rays, runs))
         crossed, grown = _grown(bender, forward, row, segment, rays, runs)
         sights, rows, at, left_out = _sights(bender, forward, crossed, row, segment, runs)
-        looked = _looked_up(bender, forward, sights, rows, at)
-        solved = [_solved(bender, forward, chain, STEPS) for chain in grown]
-        solved += [_solved(bender, forward, chain, 1) for chain in looked]
-    depths = sorted({c.which.shape[1] for c in solved})
-    chains = [Chain.joined([c for c in solved if c.which.shape[1] == d]) for d in depths]
-    return crossed, [_evaluated(bender, forward, chain, back) for chain in chains], left_out
+        candidates = [_raised(bender, forward, chain) for chain in grown]
+        candidates += _looked_up(bender, forward, sights, rows, at)
+        depths = sorted({c.which.shape[1] for c in candidates})
+        chains = [Chain.joined([c for c in candidates if c.which.shape[1] == d]) for d in depths]
+        solved = [_solved(bender, forward, chain) for chain in chains]
+    return crossed, [_evaluated(bender, forward, chain, back) for chain in solved], left_out
 
 
 def _turned(paths: Paths, back: Bool[Tensor, "p"]) -> Paths:
@@ -311,22 +312,27 @@ def _looked_up(
 # exact paths
 
 
-def _solved(bender: Bender, paths: Paths, chain: Chain, steps: int) -> Chain:
-    """The candidates that come to rest as true paths, each once; the index is raised by steps."""
+def _raised(bender: Bender, paths: Paths, chain: Chain) -> Chain:
+    """Straight paths, followed while the index grows by steps to just below what it is."""
+    batch, along = _batch(paths, chain), bender.along(chain.which, chain.act)
+    surfaces = surfaces_of(bender.world, batch, None)
+    for step in range(1, STEPS):
+        index = 1.0 + (along - 1.0) * step / STEPS
+        batch.x, _ = newton(batch, surfaces, ROUNDS, index)
+    return replace(chain, x=batch.x)
+
+
+def _solved(bender: Bender, paths: Paths, chain: Chain) -> Chain:
+    """The candidates that come to rest as true paths, each once."""
     kept = []
     for i in torch.arange(len(chain.row), device=chain.row.device).split(bender.quality.chunk):
         part = chain.take(i)
-        batch = _batch(paths, part)
-        along = bender.along(part.which, part.act)
+        batch, along = _batch(paths, part), bender.along(part.which, part.act)
         surfaces = surfaces_of(bender.world, batch, None)
-        settled = torch.ones_like(part.row, dtype=torch.bool)
-        for step in range(1, steps + 1):
-            index = 1.0 + (along - 1.0) * step / steps
-            batch.x, settled = newton(batch, surfaces, 3 * bender.quality.newton, index)
-        ok = torch.nonzero(settled).squeeze(-1)
-        part = replace(part, x=batch.x).take(ok)
-        kept.append(part.take(_true(bender, paths, part)))
-    return Chain.joined(kept)
+        batch.x, settled = newton(batch, surfaces, 3 * bender.quality.newton, along)
+        kept.append(replace(part, x=batch.x).take(torch.nonzero(settled).squeeze(-1)))
+    chain = Chain.joined(kept)
+    return chain.take(_true(bender, paths, chain))
 
 
 def _batch(paths: Paths, chain: Chain) -> Batch:
@@ -349,11 +355,10 @@ def _true(bender: Bender, paths: Paths, chain: Chain) -> Int[Tensor, "k"]:
     good &= (length > 0).all(1) & torch.isfinite(vertices).all(-1).all(-1)
     good &= on_faces(world, batch, vertices, normal, bender.wavelength).all(1)
     i = torch.nonzero(good).squeeze(-1)
-    i = i[_in_order(bender, chain.take(i), vertices[i])]
-    status = torch.full_like(chain.row[i], int(Status.OK))
+    status = torch.full_like(i, int(Status.OK))
     reach = SAME * world.size[chain.which[i]]
-    status = duplicates(batch.take(i), vertices[i], reach, status)
-    return i[status == int(Status.OK)]
+    i = i[duplicates(batch.take(i), vertices[i], reach, status) == int(Status.OK)]
+    return i[_in_order(bender, chain.take(i), vertices[i])]
 
 
 def _in_order(bender: Bender, chain: Chain, vertices: Tensor) -> Bool[Tensor, "c"]:
@@ -376,7 +381,6 @@ def _in_order(bender: Bender, chain: Chain, vertices: Tensor) -> Bool[Tensor, "c
 
 def _evaluated(bender: Bender, paths: Paths, chain: Chain, back: Tensor) -> Paths:
     """Exact paths with gradients, turned back to where they came from."""
-    chain = chain.take(_once(bender, paths, chain))
     batch, along = _batch(paths, chain), bender.along(chain.which, chain.act)
     surfaces = surfaces_of(bender.world, batch, None)
     vertices = batch.polyline(implicit_step(batch, surfaces, along))
@@ -403,15 +407,6 @@ def _evaluated(bender: Bender, paths: Paths, chain: Chain, back: Tensor) -> Path
         torch.where(capped, int(Status.CAUSTIC_CAPPED), int(Status.OK)),
     )
     return _turned(whole, back[chain.row]).take(keep)
-
-
-def _once(bender: Bender, paths: Paths, chain: Chain) -> Int[Tensor, "k"]:
-    """Chains without those that were found from several beginnings."""
-    batch = _batch(paths, chain)
-    status = torch.full_like(chain.row, int(Status.OK))
-    reach = SAME * bender.world.size[chain.which]
-    status = duplicates(batch, batch.polyline().detach(), reach, status)
-    return torch.nonzero(status == int(Status.OK)).squeeze(-1)
 
 
 def _rings(
