@@ -49,7 +49,7 @@ def crossings(world: World, rays: Rays, spans: Spans, options: MarchOptions = SE
             piece = slice(begin, begin + options.chunk)
             parts.append(_learned(world, rays, _select(rest, piece), options))
     ray, which, enter, leave = (torch.cat(column) for column in zip(*parts, strict=True))
-    aside = torch.cat([aside, aside.new_zeros(len(ray) - len(aside), 3)])
+    aside = torch.cat([aside, aside.new_zeros(len(ray) - len(aside), 2, 3)])
     # what only begins or ends on a face does not go through it
     through = torch.nonzero((leave > TOUCH) & (enter < rays.limit[ray] - TOUCH)).squeeze(-1)
     order = through[sort_by(ray[through], enter[through])]
@@ -74,7 +74,11 @@ def _normals(
 ) -> Tensor:
     ray, which = ray.repeat(2), which.repeat(2)
     finite = torch.where(torch.isfinite(t), t, torch.zeros_like(t))  # a half-space may never end
-    point = rays.origin[ray] + finite[:, None] * rays.direction[ray] + aside.repeat(2, 1)
+    point = (
+        rays.origin[ray]
+        + finite[:, None] * rays.direction[ray]
+        + aside.transpose(0, 1).flatten(0, 1)
+    )
     return world.normal(which, point)
 
 
@@ -85,8 +89,8 @@ def _zero_where(condition: Tensor, normal: Tensor) -> Tensor:
 def _convex(
     world: World, rays: Rays, spans: Spans
 ) -> tuple[list[tuple[Tensor, Tensor, Tensor, Tensor]], Tensor]:
-    """Stretches in convex nodes, then those along seams between them; and how far aside of the ray
-    their normals are asked for [m 3]."""
+    """Stretches in convex nodes, then those along seams between them; and how far aside of their two
+    ends their normals are asked for [m 2 3]."""
     ray, which = spans.ray, spans.which
     enter, leave = world.interval(which, rays.origin[ray], rays.direction[ray])
     enter = torch.clamp(enter, min=0.0)
@@ -95,7 +99,7 @@ def _convex(
     in_face = _in_face(world, rays, spans, inside, enter, leave)
     inside &= ~in_face
     parts = [(ray[inside], which[inside], enter[inside], leave[inside])]
-    aside = rays.origin.new_zeros(len(parts[0][0]), 3)
+    aside = rays.origin.new_zeros(len(parts[0][0]), 2, 3)
     if int(in_face.sum()) > 1:
         seam, off = along_seams(world, rays, _select(spans, in_face))
         parts.append((seam.ray, seam.which, seam.enter, seam.leave))

@@ -19,8 +19,8 @@ from rfsg.tracer.records import Chains, Rays, Spans
 ASIDE = (1.0, 0.7548776662466927, 0.5698402909980532)
 
 
-def along_seams(world: World, rays: Rays, spans: Spans) -> tuple[Spans, Float[Tensor, "m 3"]]:
-    """Stretches along seams, and the hair's breadth aside at which the ray is inside the node.
+def along_seams(world: World, rays: Rays, spans: Spans) -> tuple[Spans, Float[Tensor, "m 2 3"]]:
+    """Stretches along seams, and how far aside of either end the surface of the node is.
 
     spans: of flat-faced nodes that the rays themselves are not inside.
 
@@ -38,8 +38,22 @@ def along_seams(world: World, rays: Rays, spans: Spans) -> tuple[Spans, Float[Te
     both = torch.unique(torch.cat([i[first], len(a.ray) + j[~first]]))
     names = Spans.__dataclass_fields__
     seams = Spans(*(torch.cat([getattr(a, n), getattr(b, n)])[both] for n in names))
-    side = torch.where(both < len(a.ray), 1.0, -1.0)[:, None].to(aside)
-    return seams, side * aside
+    aside = torch.where(both < len(a.ray), 1.0, -1.0)[:, None].to(aside) * aside
+    straight = _straightened(world, rays, seams, aside)
+    direction = rays.direction[seams.ray]
+    slips = (seams.enter - straight.enter, seams.leave - straight.leave)
+    return straight, torch.stack([aside + slip[:, None] * direction for slip in slips], 1)
+
+
+def _straightened(world: World, rays: Rays, seams: Spans, aside: Float[Tensor, "m 3"]) -> Spans:
+    """The same stretches on the rays themselves: from where they lie at one hair and at two."""
+    origin, direction = rays.origin[seams.ray], rays.direction[seams.ray]
+    enter, leave = world.interval(seams.which, origin + 2.0 * aside, direction)
+    enter, leave = enter.clamp(min=0.0), torch.minimum(leave, rays.limit[seams.ray])
+    hit = leave > enter
+    enter = torch.where(hit, 2.0 * seams.enter - enter, seams.enter)
+    leave = torch.where(hit, 2.0 * seams.leave - leave, seams.leave)
+    return Spans(seams.ray, seams.which, enter, leave)
 
 
 def _shifted(world: World, rays: Rays, spans: Spans, aside: Float[Tensor, "3"]) -> Spans:

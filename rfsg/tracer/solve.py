@@ -414,7 +414,8 @@ def _gather(
             chains.patch[keep],
             vertices,
             whole.normal[keep],
-            segments(vertices)[0].sum(1),
+            # in order of length, so that the sum is the same to the bit from either end
+            segments(vertices)[0].sort(1).values.sum(1),
             whole.spread[keep],
             whole.caustics[keep],
             whole.status[keep],
