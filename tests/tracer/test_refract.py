@@ -24,8 +24,8 @@ from rfsg.tracer.simulate import simulate
 from tests.scenes import box_node, radio, vector
 
 C = 299_792_458.0
-DIRECT = Quality(depth=0, floor_db=-300.0)
-ONCE = Quality(depth=1, floor_db=-150.0)
+DIRECT = Quality(depth=0, diffraction=0, floor_db=-300.0)
+ONCE = Quality(depth=1, diffraction=0, floor_db=-150.0)
 
 
 def solid(n: float, sigma: float = 0.0) -> Solid:

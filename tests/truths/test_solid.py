@@ -21,7 +21,7 @@ from tests.scenes import box_node, radio
 
 C = 299_792_458.0
 EPS0 = 8.8541878188e-12
-DIRECT = Quality(depth=0, floor_db=-300.0)
+DIRECT = Quality(depth=0, diffraction=0, floor_db=-300.0)
 CONCRETE = {"eps_r": 5.24, "sigma": 0.15}
 WALLS = {"slab": lambda d: Slab(d, **CONCRETE), "solid": lambda d: Solid(**CONCRETE)}
 
@@ -99,7 +99,7 @@ def test_solid_wall_is_the_slab_of_its_thickness(angle, f):
         lean = scene.transmitters[0].position[1].item()
         other = radio("/r2", -2.0, -lean - 1.0, 0.3, polarization="V")
         scene = Scene(scene.nodes, scene.transmitters, (*scene.receivers, other))
-        results.append(simulate(scene, f, Quality(depth=1, floor_db=-300.0)))
+        results.append(simulate(scene, f, Quality(depth=1, diffraction=0, floor_db=-300.0)))
     slab, solid = (r.channel for r in results)
     assert len(slab.delay) == len(solid.delay) == 3
     torch.testing.assert_close(solid.delay, slab.delay, rtol=1e-13, atol=0)
@@ -183,7 +183,7 @@ def test_no_reflection_at_brewsters_angle():
     ):
         node = Node("/s", Body(shape, Solid(eps_r=n * n)), Pose.identity())
         radios = tuple(radio(p, *x, polarization="V") for p, x in (("/t", tx), ("/r", rx)))
-        quality = Quality(depth=1, floor_db=-600.0)
+        quality = Quality(depth=1, diffraction=0, floor_db=-600.0)
         channel = simulate(Scene((node,), radios[:1], radios[1:]), 2.4e9, quality).channel
         jones = (channel.jones[:, 0].abs() * channel.delay[:, None, None] * C).amax((1, 2))
         both = torch.linalg.svdvals(channel.jones[1, 0])
@@ -428,7 +428,7 @@ def test_mirrored_behind_a_ball():
     tx, rx, image = (-3.0, 0.1, 1.6), (3.5, 0.2, -0.6), (3.5, 0.2, -2.4)
     alone = ball_node("/b", radius, n)
     want = simulate(Scene((alone,), (radio("/t", *tx),), (radio("/r", *image),)), 5e9, DIRECT)
-    quality = Quality(depth=1, floor_db=-300.0)
+    quality = Quality(depth=1, diffraction=0, floor_db=-300.0)
     scene = Scene((alone, floor), (radio("/t", *tx),), (radio("/r", *rx),))
     found = simulate(scene, 5e9, quality)
     mine = (found.paths.which == 0).any(1) & (found.paths.which == 1).any(1)
