@@ -312,6 +312,41 @@ def test_prism_deviates_by_snells_law():
     assert math.acos(float(bent)) == pytest.approx(deviation, rel=1e-9)
 
 
+def test_prism_passes_each_polarisation_by_its_own_share():
+    """Level through a prism on edge: V is TE at both faces, H is TM, and nothing is exchanged."""
+    n, f = 1.3, 5e9
+    tx, d, rx = least_deviation(n)
+    radios = tuple(radio(p, *x, polarization="V") for p, x in (("/t", tx), ("/r", rx)))
+    channel = simulate(Scene((prism(n),), radios[:1], radios[1:]), f, DIRECT).channel
+    cosine = abs(d @ np.array([-1.0, 1.0, 0.0])) / math.sqrt(2)
+    inner = math.sqrt(1 - (1 - cosine**2) / n**2)
+    te = 4 * n * cosine * inner / (cosine + n * inner) ** 2
+    tm = 4 * n * cosine * inner / (n * cosine + inner) ** 2
+    spread = numerical_spreading(tx, d, n, wedge(1.0), 1.5)
+    free = C / f / (4 * math.pi) * spread
+    jones = channel.jones[0, 0].numpy() / free
+    np.testing.assert_allclose(jones, [[te, 0.0], [0.0, -tm]], rtol=1e-6, atol=1e-9)
+
+
+def test_a_faint_lens_is_nearly_nothing():
+    """As n goes to 1 each bent path becomes the straight one: field vectors, phase, spreading."""
+    radios = (
+        radio("/t", -2.0, 0.1, 0.3, polarization="V"),
+        radio("/r", 1.5, 0.2, -0.2, polarization="V"),
+    )
+    turned = Pose.at(0, 0, 0, 30.0)
+    bodies = (Sphere(0.5), Box([0.4, 0.3, 0.5]))
+    free = simulate(Scene((), radios[:1], radios[1:]), 2e9, DIRECT).channel
+    for shape in bodies:
+        node = Node("/s", Body(shape, Solid(eps_r=1.0 + 1e-6)), turned)
+        result = simulate(Scene((node,), radios[:1], radios[1:]), 2e9, DIRECT)
+        assert result.status_counts["REFRACTED"] == 1  # the straight one is gone
+        close = (result.channel.delay - free.delay).abs().argmin()
+        size = free.jones.abs().max()
+        gap = (result.channel.jones[close] - free.jones[0]).abs().max() / size
+        assert float(gap) < 1e-4  # k (n - 1) L is 2e-5
+
+
 @pytest.mark.parametrize("lean", [(0.3, 0.1), (0.5, -0.2), (0.35, 0.2)])
 def test_prism_off_its_axis(lean):
     tx = np.array([-1.9, 0.35, 0.1])
