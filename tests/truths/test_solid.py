@@ -90,7 +90,7 @@ def test_wall_transmits_as_the_transfer_matrix_says(kind, angle, f):
 
 
 @pytest.mark.parametrize("f", [2.4e9, 28e9])
-@pytest.mark.parametrize("angle", [0.0, 30.0, 60.0, 85.0])
+@pytest.mark.parametrize("angle", [0.0, 60.0, 85.0])
 def test_solid_wall_is_the_slab_of_its_thickness(angle, f):
     """Through it and off it, to rounding: amplitude, phase, delay, TE and TM."""
     results = []
@@ -379,7 +379,7 @@ def ball_node(path, radius, n, x=0.0, surface=None):
     return Node(path, Body(Sphere(radius), surface or Solid(eps_r=n * n)), Pose.at(x, 0, 0))
 
 
-@pytest.mark.parametrize("n", [1.2, 1.5, 1.9])
+@pytest.mark.parametrize("n", [1.2, 1.9])
 @pytest.mark.parametrize("after", [0.03, 0.4, 5.0])
 def test_ball_lens_on_its_axis(n, after):
     """Exact there: S = 1 / |B|; delay by the optical length; each focus passed turns both planes, and
@@ -415,8 +415,8 @@ def test_two_balls_in_a_row():
     assert float(result.paths.spread[k]) == pytest.approx(1 / abs(b), rel=1e-9)
 
 
-@pytest.mark.parametrize("height", [0.1, 0.25, 0.4, 0.48])
-@pytest.mark.parametrize("distance", [0.2, 1.0, 8.0])
+@pytest.mark.parametrize("height", [0.1, 0.4, 0.48])
+@pytest.mark.parametrize("distance", [0.2, 8.0])
 def test_ball_off_its_axis(height, distance):
     """Skew rays, before and behind their foci, up to nearly grazing."""
     tx, radius, n = np.array([-3.0, 0.2, -0.1]), 0.5, 1.5
