@@ -116,7 +116,8 @@ def _in_face(
     leave = torch.where(inside, leave, spans.leave)
     long = world.flat[spans.which] & (leave - enter > TOUCH)
     i = torch.nonzero(long).squeeze(-1)
-    middle = 0.5 * (enter + torch.where(torch.isfinite(leave), leave, enter))[i]
+    # a ray that never leaves a half-space is asked for a metre further on
+    middle = torch.where(torch.isfinite(leave), 0.5 * (enter + leave), enter + 1.0)[i]
     ray = spans.ray[i]
     point = rays.origin[ray] + middle[:, None] * rays.direction[ray]
     in_face = torch.zeros_like(long)

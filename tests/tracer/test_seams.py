@@ -12,7 +12,11 @@ from rfsg.objects.surfaces.interface import Conductor
 from rfsg.objects.surfaces.solid import Solid
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
+from rfsg.scene.world import World
+from rfsg.tracer.embree import Proxies
+from rfsg.tracer.march import crossings
 from rfsg.tracer.plan import Quality
+from rfsg.tracer.records import Rays
 from rfsg.tracer.simulate import Result, simulate
 from tests.scenes import box_node, radio, vector
 
@@ -147,6 +151,20 @@ def test_an_edge_belongs_to_its_face():
         tx, rx = (outer.point_world(vector(x, 0.0, 2.0)).tolist() for x in (-2.0, 2.0))
         scene = Scene((node,), (radio("/t", *tx),), (radio("/r", *rx),))
         assert simulate(scene, 2.4e9, FLOOR).status_counts == {"OK": 2}
+
+
+def test_a_ray_without_end_enters_the_ground():
+    """In a face is what runs along it, not what goes in for good."""
+    world = World(Scene((Node("/g", Body(HalfSpace(), Conductor()), Pose.identity()),)))
+    down = torch.nn.functional.normalize(vector(1.0, 0.0, -1e-3), dim=0)
+    rays = Rays(
+        vector(0.0, 0.0, 1.0).repeat(3, 1),
+        torch.stack([vector(0.0, 0.0, -1.0), down, vector(1.0, 0.0, 0.0)]),
+        torch.full((3,), math.inf, dtype=torch.float64),
+    )
+    found = crossings(world, rays, Proxies(world).spans(rays))
+    assert found.ray.tolist() == [0, 1]
+    torch.testing.assert_close(found.enter, vector(1.0, 1.0 / -down[2]))
 
 
 def test_radios_nearer_than_a_nanometre_coincide():
