@@ -202,8 +202,7 @@ def _placed(world: World, paths: Paths, path: Tensor, segment: Tensor, runs: Run
             turning = unit(world.value_and_gradient(which, point)[1])
             # on an edge the slope may be that of the other face
             alike = (turning * normals[k]).sum(-1, keepdim=True) > 0.5
-            turns = on_boundary & alike & world.exact[which, None]
-            points[k], normals[k] = point, torch.where(turns, turning, normals[k])
+            points[k], normals[k] = point, torch.where(on_boundary & alike, turning, normals[k])
     return Crossing(*points, *normals)
 
 
