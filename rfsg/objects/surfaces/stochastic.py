@@ -316,7 +316,7 @@ def _squareplus(x: Tensor) -> Tensor:
 
 def _normalised(shape: Shape, point: Tensor) -> Tensor:
     """Points in half diagonals of the object about its middle; metres if it has no bounds."""
-    low, high = shape.bounds().detach().to(point)
+    low, high = shape.bounds().to(point)
     middle, half = 0.5 * (low + high), 0.5 * (high - low).norm()
     bounded = torch.isfinite(low).all() & torch.isfinite(high).all() & (half > 0)
     middle = torch.where(bounded, middle, torch.zeros_like(middle))
