@@ -22,8 +22,9 @@ test: lint
 test-all: lint
 	$(BIN)/python -m pytest -q -rs --strict-skips -m ""
 
-bench: .venv/.installed
+bench: .venv/.installed-dev
 	$(BIN)/python benchmarks/speed.py
+	$(BIN)/python benchmarks/stability.py
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .
