@@ -9,31 +9,22 @@ import torch
 from rfsg.objects.body import Body
 from rfsg.objects.catalogue import SHAPES, SURFACES, shape_class, surface_class
 from rfsg.objects.contract import Contact, Crossing, Shape, Surface
-
-# The least that a constructor needs.
-SHAPE_ARGUMENTS = {
-    "box": {"half_size": [0.2, 0.3, 0.4]},
-    "sphere": {"radius": 0.3},
-    "cylinder": {"radius": 0.2, "half_height": 0.4},
-    "capsule": {"radius": 0.2, "half_height": 0.3},
-    "halfspace": {},
-    "neural": {"bounds": [[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]], "width": 8, "depth": 3, "skip": 1},
-}
-SURFACE_ARGUMENTS = {
-    "conductor": {},
-    "halfspace": {"itu": "concrete"},
-    "slab": {"thickness_m": 0.1, "eps_r": 3.0, "sigma": 0.02},
-    "solid": {"eps_r": 3.0, "sigma": 0.02},
-    "stochastic": {"m": 0.5, "bulk": 0.2},
-}
+from tests.laws import catalogue as examples
 
 
 def make_shape(kind: str):
-    return shape_class(kind)(**SHAPE_ARGUMENTS[kind])
+    return next(iter(examples.SHAPES[kind].values()))()
 
 
 def make_surface(kind: str):
-    return surface_class(kind)(**SURFACE_ARGUMENTS[kind])
+    return next(iter(examples.SURFACES[kind].values()))()
+
+
+def test_every_kind_has_an_example_that_the_laws_are_tried_on():
+    for known, table in ((SHAPES, examples.SHAPES), (SURFACES, examples.SURFACES)):
+        assert known.keys() == table.keys()
+        for kind, some in table.items():
+            assert some and {make().kind for make in some.values()} == {kind}
 
 
 @pytest.mark.parametrize(
@@ -54,6 +45,8 @@ def _close(a, b) -> bool:
     """Equal, but for the rounding of what is kept as a logarithm."""
     if isinstance(b, list):
         return len(a) == len(b) and all(map(_close, a, b))
+    if isinstance(b, dict):
+        return a.keys() == b.keys() and all(_close(a[name], b[name]) for name in b)
     return math.isclose(a, b, rel_tol=1e-12) if isinstance(b, float) else a == b
 
 
