@@ -9,9 +9,9 @@ plane through each, lines where neighbouring planes meet, and of these what the 
 have both faces beside it. They carry no gradients.
 """
 
+import hashlib
 import math
 from dataclasses import dataclass
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -260,7 +260,8 @@ SHORTEST = (
 )
 BESIDE = (1.0, 2.0)  # of the grid step: where the network is asked for the faces of an edge
 
-_FOUND: "WeakKeyDictionary[Shape, tuple[tuple, Edges]]" = WeakKeyDictionary()
+_FOUND: dict[bytes, Edges] = {}
+MOST_KEPT = 256
 
 
 def learned_edges(shape: Shape, angle_deg: float = 30.0) -> Edges:
@@ -269,13 +270,28 @@ def learned_edges(shape: Shape, angle_deg: float = 30.0) -> Edges:
     Patches number the flat pieces (they are not ``Shape.patch``). Kept while the parameters stay as
     they are. Raises ValueError for a shape without a surface, as ``proxy.extract_mesh`` does.
     """
-    parameters = list(getattr(shape, "parameters", list)())
-    state = (angle_deg, *((p.data_ptr(), p._version) for p in parameters))
-    kept = _FOUND.get(shape)
-    if kept is None or kept[0] != state:
-        kept = (state, _find(shape, angle_deg))
-        _FOUND[shape] = kept
-    return kept[1]
+    key = _digest(shape, angle_deg)
+    if key is None:
+        return _find(shape, angle_deg)
+    if key not in _FOUND:
+        if len(_FOUND) >= MOST_KEPT:
+            _FOUND.clear()
+        _FOUND[key] = _find(shape, angle_deg)
+    return _FOUND[key]
+
+
+def _digest(shape: Shape, angle_deg: float) -> bytes | None:
+    """What a learned shape is, whichever copy of it is asked; None without parameters to tell by."""
+    state = getattr(shape, "state_dict", dict)()
+    if not state:
+        return None
+    content = hashlib.sha256(
+        f"{shape.kind} {shape.config()} {shape.bounds().tolist()} {angle_deg}".encode()
+    )
+    for name, value in state.items():
+        content.update(f"{name} {value.dtype} {value.device}".encode())
+        content.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return content.digest()
 
 
 @dataclass(frozen=True)
