@@ -168,7 +168,9 @@ def march(
     dtype = options.dtype
     p0, d, end = start.to(dtype), direction.to(dtype), length.to(dtype)
     t = torch.zeros_like(end)
-    f = shape.sdf(p0)
+    f = shape.sdf(
+        p0
+    ).clone()  # written to below, and a half-space answers with a view of its points
     roots = end.new_full((len(end), MOST_ROOTS), torch.inf)
     count = torch.zeros(len(end), dtype=torch.int64, device=end.device)
     starts_inside = f < 0
