@@ -143,10 +143,20 @@ def test_a_face_passes_what_it_does_not_reflect():
     eps = solid.medium.permittivity(FREQUENCY)
     reflected = torch.stack(fresnel.interface(cosine[:, None], eps), -1).abs() ** 2
     torch.testing.assert_close(passed + reflected, torch.ones_like(passed), rtol=0, atol=1e-12)
-    lossy = Solid(eps_r=3.0, sigma=5.0)
-    eps = lossy.medium.permittivity(FREQUENCY)
-    r = torch.stack(fresnel.interface(cosine[:, None], eps), -1)
-    torch.testing.assert_close(lossy.face(cosine, FREQUENCY) ** 2, 1 - r**2, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [0.5, 5.0, 500.0])
+def test_a_face_of_a_lossy_solid_passes_no_more_than_all(sigma):
+    """sqrt(1 - R^2), and where that would amplify, its phase alone."""
+    lossy = Solid(eps_r=3.0, sigma=sigma)
+    cosine = torch.linspace(0, 1, 101, dtype=F64)
+    r = torch.stack(fresnel.interface(cosine[:, None], lossy.medium.permittivity(FREQUENCY)), -1)
+    square, passed = 1 - r**2, lossy.face(cosine, FREQUENCY)
+    assert float(square.abs().max()) > 1.001  # the case is among them
+    torch.testing.assert_close(
+        passed**2, square / square.abs().clamp(min=1.0), rtol=1e-9, atol=1e-9
+    )
+    assert float(passed.abs().max()) <= 1 + 1e-12
 
 
 def test_a_solid_of_vacuum_is_not_there():
