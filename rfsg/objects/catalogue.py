@@ -12,6 +12,7 @@ SHAPES = {
     "cylinder": "rfsg.objects.shapes.analytic:Cylinder",
     "capsule": "rfsg.objects.shapes.analytic:Capsule",
     "halfspace": "rfsg.objects.shapes.analytic:HalfSpace",
+    "mesh": "rfsg.objects.shapes.mesh:Mesh",
     "neural": "rfsg.objects.shapes.neural:NeuralShape",
 }
 SURFACES = {

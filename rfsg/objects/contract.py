@@ -57,9 +57,12 @@ class Crossing:
 class Shape(Protocol):
     """Where a thing is. A ``torch.nn.Module`` (its parameters are what a fit may change)."""
 
-    kind: str  # token in files: "box", "sphere", "cylinder", "capsule", "halfspace", "neural"
+    kind: (
+        str  # token in files: "box", "sphere", "cylinder", "capsule", "halfspace", "mesh", "neural"
+    )
     lipschitz: float  # |sdf(p) - sdf(q)| <= lipschitz * |p - q| within bounds: a computed bound
     convex: bool  # a line meets it in at most one stretch, and ``interval`` gives it in closed form
+    faceted: bool  # every patch is a plane
     exact: bool  # True: jets are the true surface. False: learned; it ripples, measure at the wave's scale
 
     def config(self) -> dict[str, object]:

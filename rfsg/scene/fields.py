@@ -11,6 +11,7 @@ import numpy as np
 from numpy import ndarray
 
 from rfsg.objects.physics.lobes import LOBES
+from rfsg.objects.shapes.topology import MAX_TRIANGLES
 from rfsg.scene.antennas import PATTERNS, POLARIZATIONS
 from rfsg.scene.arrays import MAX_ELEMENTS, UNITS
 from rfsg.scene.materials import MODELS
@@ -25,6 +26,7 @@ class Field:
     kind: str
     tokens: tuple[str, ...] = ()
     positive: bool = False
+    most: int = MAX_ELEMENTS  # rows of an array
     fallback: Any = None
 
     def amiss(self, value: Any) -> str | None:
@@ -38,8 +40,8 @@ class Field:
             return None if fine else "three finite numbers"
         if self.kind == "double3[]":
             fine = isinstance(value, ndarray) and value.ndim == 2 and value.shape[1] == 3
-            fine = fine and 1 <= len(value) <= MAX_ELEMENTS and bool(np.isfinite(value).all())
-            return None if fine else f"1 to {MAX_ELEMENTS} triples of finite numbers"
+            fine = fine and 1 <= len(value) <= self.most and bool(np.isfinite(value).all())
+            return None if fine else f"1 to {self.most} triples of finite numbers"
         if self.kind == "int" and self.positive:
             return None if isinstance(value, int) and value > 0 else "a whole number > 0"
         if self.tokens:
@@ -87,5 +89,6 @@ RADIO = (
 )
 SHAPE = Field("rfsg:shape", "token", tokens=("halfspace",))
 VELOCITY = Field("rfsg:velocity", "double3")
+MESH_POINTS = Field("rfsg:mesh:points", "double3[]", most=3 * MAX_TRIANGLES)
 FREQUENCY = Field("rfsg:frequencyHz", "double", positive=True)
-FIELDS = {f.name: f for f in (*NEURAL, *MATERIAL, *RADIO, SHAPE, VELOCITY, FREQUENCY)}
+FIELDS = {f.name: f for f in (*NEURAL, *MATERIAL, *RADIO, SHAPE, VELOCITY, MESH_POINTS, FREQUENCY)}

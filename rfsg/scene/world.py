@@ -58,7 +58,8 @@ class World:
         self.box_of_node = torch.cumsum(is_box.long(), 0) - 1
         self.bounds_object = _stack([n.body.shape.bounds() for n in nodes], (2, 3), self.device)
         self.exact = self._flags(lambda b: b.shape.exact)
-        self.flat = self._flags(lambda b: isinstance(b.shape, (Box, HalfSpace)))
+        self.flat = self._flags(lambda b: b.shape.faceted and b.shape.convex)
+        self.rectangular = self._flags(lambda b: isinstance(b.shape, (Box, HalfSpace)))
         self.convex = self._flags(lambda b: b.shape.convex)
         self.opaque = self._flags(lambda b: b.surface.opaque)
         self.learned_surface = self._flags(lambda b: b.surface.kind == "stochastic")

@@ -28,6 +28,7 @@ from rfsg.tracer.implicit import segments
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Act, Found, Paths, Status
 from rfsg.tracer.sequences import Budget, Prefixes, TooMany, levels
+from rfsg.tracer.solve import COINCIDENT
 
 ROUNDS = 30  # Newton steps; the length is convex along straight edges
 HALVINGS = 12
@@ -302,7 +303,7 @@ def _exact(
         inside = line.within() & first_on & last_on & free
         status = torch.where(inside, status, int(Status.OFF_SURFACE))
         status = torch.where(settled, status, int(Status.NOT_CONVERGED))
-        degenerate = (length <= 0).any(1) | (sine <= 0).any(1) | ~torch.isfinite(spread)
+        degenerate = (length <= COINCIDENT).any(1) | (sine <= 0).any(1) | ~torch.isfinite(spread)
         status = torch.where(degenerate, int(Status.DEGENERATE), status)
     return Paths(
         bends.tx, bends.rx, which, act, item, vertices, normal, length.sum(1), spread,

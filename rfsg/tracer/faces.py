@@ -68,38 +68,51 @@ class Samples:
 
 @torch.no_grad()
 def planes_of(world: World) -> Planes:
-    """Every planar face in the world; a face reaches as far as its object's bounds."""
+    """Every planar face in the world, as a rectangle that holds it."""
     return moving_planes_of(world)
 
 
 def moving_planes_of(world: World) -> Planes:
     """The same, differentiable in poses and sizes."""
-    tables = {id(n.body.shape): n.body.shape.planes() for n in world.scene.nodes}
-    rows = [tables[id(n.body.shape)].to(world.translation) for n in world.scene.nodes]
-    each = [torch.arange(len(table), device=world.device) for table in rows]
+    shapes = {id(n.body.shape): n.body.shape for n in world.scene.nodes}
+    tables = {key: _rectangles(shape) for key, shape in shapes.items()}
+    rows = [tables[id(n.body.shape)] for n in world.scene.nodes]
+    each = [torch.arange(len(table[0]), device=world.device) for table in rows]
     node = torch.arange(len(rows), device=world.device)
-    node = node.repeat_interleave(torch.tensor([len(t) for t in rows], dtype=torch.int64).to(node))
-    blank = world.translation.new_zeros(0, 4)
-    patch, row = torch.cat([node[:0], *each]), torch.cat([blank, *rows])
-    normal, (low, high) = row[:, :3], world.bounds_object[node].unbind(1)
-    middle = torch.where(torch.isfinite(low + high), 0.5 * (low + high), torch.zeros_like(low))
-    centre = middle + (row[:, 3] - (middle * normal).sum(-1))[:, None] * normal
-    axis = normal.abs().argmax(-1, keepdim=True) if len(row) else node[:, None]
-    others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=world.device)[axis.squeeze(-1)]
-    eye = torch.eye(3, dtype=torch.float64, device=world.device)
-    edges = [world.direction_world(node, eye[others[:, k]]) for k in (0, 1)]
-    half = (0.5 * (high - low)).gather(1, others) * world.scale[node, None]
-    normal_world = world.direction_world(node, normal)
-    place = (normal_world * world.translation[node]).sum(-1)
+    node = node.repeat_interleave(torch.tensor([len(t) for t in each], dtype=torch.int64).to(node))
+    zero = world.translation.new_zeros
+    blank = (zero(0, 4), zero(0, 3), zero(0, 2, 3), zero(0, 2))
+    columns = zip(blank, *rows, strict=True)
+    plane, centre, edges, half = (torch.cat([x.to(zero(0)) for x in c]) for c in columns)
+    normal = world.direction_world(node, plane[:, :3])
+    place = (normal * world.translation[node]).sum(-1)
     return Planes(
         node,
-        patch,
-        normal_world,
-        row[:, 3] * world.scale[node] + place,
+        torch.cat([node[:0], *each]),
+        normal,
+        plane[:, 3] * world.scale[node] + place,
         world.point_world(node, centre),
-        torch.stack(edges, 1),
-        half,
+        torch.stack([world.direction_world(node, edges[:, k]) for k in (0, 1)], 1),
+        half * world.scale[node, None],
     )
+
+
+def _rectangles(shape: Shape) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Planes [k 4] of a shape, and of a rectangle on each the centre [k 3], edges [k 2 3] and half
+    sides [k 2]; inf where a face has no end.
+
+    A shape says its own, or its faces lie across the axes and reach as far as its bounds.
+    """
+    planes, own = shape.planes(), getattr(shape, "rectangles", None)
+    if own is not None:
+        return planes, *own()
+    (low, high), normal = shape.bounds().to(planes), planes[:, :3]
+    middle = torch.where(torch.isfinite(low + high), 0.5 * (low + high), torch.zeros_like(low))
+    centre = middle + (planes[:, 3] - normal @ middle)[:, None] * normal
+    others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=planes.device)
+    others = others[normal.abs().argmax(-1)] if len(planes) else others[:0, :2]
+    eye = torch.eye(3, dtype=planes.dtype, device=planes.device)
+    return planes, centre, eye[others], (0.5 * (high - low))[others]
 
 
 @torch.no_grad()
@@ -232,8 +245,7 @@ def _shoot(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     blank = torch.zeros(0, 3, dtype=torch.float64, device=device)
     nothing = (blank, blank, torch.zeros(0, dtype=torch.int64, device=device))
     bounds = shape.bounds().to(device=device, dtype=torch.float64)
-    flat = shape.planes().shape[0]
-    if not bool(torch.isfinite(bounds).all()) or (shape.exact and flat == 6):
+    if shape.faceted or not bool(torch.isfinite(bounds).all()):
         return nothing
     origin, direction, length = _aim(bounds)
     if shape.convex:
@@ -248,6 +260,7 @@ def _shoot(shape: Shape, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     normal_at = getattr(shape, "normal_at", None)
     normal = normal_at(point) if normal_at else unit(shape.value_and_gradient(point)[1])
     patch = shape.patch(point)
+    flat = len(shape.planes())
     curved = torch.ones_like(patch, dtype=torch.bool) if not shape.exact else patch >= flat
     return point[curved], normal[curved], patch[curved]
 

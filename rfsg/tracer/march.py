@@ -163,8 +163,12 @@ def march(
 ) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Float[Tensor, "k"]]:
     """Stretches (row, enter, leave) where f < 0 along start + t direction, 0 <= t <= length [m].
 
-    Steps are max(|f| / L, step_floor): with L a true bound none skips anything thicker than the floor.
+    A shape that is not convex may say them in closed form. Else steps are max(|f| / L, step_floor):
+    with L a true bound none skips anything thicker than the floor.
     """
+    own = getattr(shape, "stretches", None)
+    if own is not None and not shape.convex:
+        return own(start, direction, length)
     dtype = options.dtype
     p0, d, end = start.to(dtype), direction.to(dtype), length.to(dtype)
     t = torch.zeros_like(end)

@@ -10,7 +10,7 @@ from rfsg.objects.contract import Crossing
 from rfsg.scene.world import FLUSH, World, unit
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.implicit import segments
-from rfsg.tracer.march import EVALUATE, crossings
+from rfsg.tracer.march import EVALUATE, TOUCH, crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Crossings, Paths, Rays, Spans, runs_in
 
@@ -183,8 +183,8 @@ def _own(
     ):
         mine = (reflecting[p, vertex] == inside.which) & (inside.which >= 0)
         cosine = (rays.direction[ray] * normals[p, vertex]).sum(-1).abs()
-        shallow = far * cosine <= OWN_RIPPLE * wavelength
-        touching = near * cosine <= OWN_RIPPLE * wavelength
+        ripple = torch.where(world.exact[inside.which], TOUCH, OWN_RIPPLE * wavelength)
+        shallow, touching = far * cosine <= ripple, near * cosine <= ripple
         own |= mine & (world.convex[inside.which] | (shallow & touching))
     return own
 

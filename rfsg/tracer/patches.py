@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.analytic import Box
+from rfsg.objects.shapes.mesh import Mesh
 from rfsg.scene.scene import SceneError
 from rfsg.scene.world import World, unit
 from rfsg.tracer.cells import GRAZING, MOST_CELLS, Meeting
@@ -74,8 +75,8 @@ def patches_of(world: World, path: str, cell: float, offset: float) -> Patches:
     _check_sizes(path, cell, offset)
     which, node = world.scene.index(path), world.scene.node(path)
     shape, scale = node.body.shape, float(node.pose.scale)
-    if isinstance(shape, Box):
-        vertices, faces = _box_mesh(shape)
+    if isinstance(shape, (Box, Mesh)):
+        vertices, faces = _box_mesh(shape) if isinstance(shape, Box) else _own_mesh(shape)
         triangle, owner, middle = _quartered(_cut(vertices[faces], cell / scale, path))
     else:
         from rfsg.objects.shapes.proxy import extract_mesh  # brings scikit-image along
@@ -166,6 +167,10 @@ def _box_mesh(box: Box) -> tuple[Tensor, Tensor]:
     side = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]]
     faces = [[s[0], s[i], s[i + 1]] for s in side for i in (1, 2)]
     return torch.where(bit, high.cpu(), low.cpu()), torch.tensor(faces)
+
+
+def _own_mesh(mesh: Mesh) -> tuple[Tensor, Tensor]:
+    return mesh.vertices.detach().cpu(), mesh.triangles.cpu()
 
 
 def _cut(triangle: Float[Tensor, "c 3 3"], cell: float, name: str) -> Float[Tensor, "k 3 3"]:

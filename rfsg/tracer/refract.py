@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
+from rfsg.objects.physics.fresnel import SPEED_OF_LIGHT
 from rfsg.scene.world import FLUSH, World, unit
 from rfsg.tracer import pencils
 from rfsg.tracer.acting import Acting, dyad_of, scalar
@@ -40,7 +41,6 @@ STEPS = 4  # of the index, from 1 to what it is
 ROUNDS = 6  # of Newton's method at each but the last: near enough for the next
 MOST_SIGHTS = 20_000  # lattices of rays: some minutes' worth
 SAME = 1e-5  # of the solids' size: paths nearer to each other are one
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,9 @@ def _sights(
     left_out = []
     if not paths.which.shape[1]:
         # a box sends rays between neighbouring faces only if its index is below sqrt(2)
-        aside = torch.nonzero(bender.bending & finite & ~(world.flat & (bender.index >= 2**0.5)))
+        aside = torch.nonzero(
+            bender.bending & finite & ~(world.rectangular & (bender.index >= 2**0.5))
+        )
         aside = aside.squeeze(-1)
         if len(aside) * len(paths.tx) <= MOST_SIGHTS:
             free = torch.ones_like(crossed)

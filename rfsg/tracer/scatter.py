@@ -102,7 +102,7 @@ def paths_of(
     planes = moving_planes_of(world)
     curved = [
         curved_tiles(world, n, quality.diffuse)
-        for n in torch.nonzero(rough & ~world.flat).squeeze(-1).tolist()
+        for n in torch.nonzero(rough & ~world.rectangular).squeeze(-1).tolist()
     ]
     scene = _Scene(world, planes, rough, curved, tx, rx, quality)
     here, there = (_ends(planes, x, mirrored=False) for x in (tx, rx))
@@ -172,7 +172,7 @@ def _scattered(scene: _Scene, sources: Ends, targets: Ends, most: int) -> Paths:
 def _planar(scene: _Scene, sources: Ends, targets: Ends, most: int) -> Lit:
     """Tiles of rough rectangles between every source and every target in front of them."""
     world, planes, count = scene.world, scene.planes, scene.quality.diffuse
-    row = torch.nonzero((scene.rough & world.flat)[planes.node]).squeeze(-1)
+    row = torch.nonzero((scene.rough & world.rectangular)[planes.node]).squeeze(-1)
     if len(sources) * len(targets) * len(row) > MOST_PAIRS:
         raise TooManyTiles
     with torch.no_grad():

@@ -5,6 +5,7 @@ near fields, materials within the band that they were measured in. Beyond, the t
 number, and says here why it should not be believed.
 """
 
+import math
 from collections.abc import Callable, Iterable
 
 import torch
@@ -13,6 +14,8 @@ from torch import Tensor
 
 from rfsg.objects.body import Body
 from rfsg.objects.physics import media
+from rfsg.objects.physics.fresnel import SPEED_OF_LIGHT
+from rfsg.objects.shapes.mesh import Mesh
 from rfsg.objects.shapes.presence import absence
 from rfsg.objects.surfaces.interface import Dielectric
 from rfsg.scene.errors import SceneError
@@ -20,7 +23,6 @@ from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Node
 from rfsg.scene.world import World
 
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
 SHOWN = 5  # names in a sentence before "and more"
 PAIRS = 1 << 20  # of radios and objects looked at together: bounds memory
 
@@ -43,6 +45,7 @@ def sentences(world: World, frequency: Float[Tensor, "f"]) -> tuple[str, ...]:
     wavelength = SPEED_OF_LIGHT / float(frequency.min())
     said = (
         _small(world, wavelength),
+        _round_meshes(world),
         _close_radios(world, wavelength),
         *_surfaces_near_radios(world, wavelength),
         *_extrapolated(world, frequency),
@@ -133,6 +136,32 @@ def _small(world: World, wavelength: float) -> str:
         f"narrower than a wavelength ({wavelength:.3g} m): rays do not describe how waves scatter "
         "from them; trust neither their reflections nor their shadows",
     )
+
+
+def _round_meshes(world: World) -> str:
+    """Meshes whose faces mostly turn a little from one to the next."""
+    shapes = {id(n.body.shape): n.body.shape for n in world.scene.nodes}
+    found = {key for key, s in shapes.items() if isinstance(s, Mesh) and is_round(s)}
+    return _sentence(
+        [n.path for n in world.scene.nodes if id(n.body.shape) in found],
+        "a mesh that stands for a round surface: each facet is a flat mirror, too strong "
+        "where it reflects, and nothing between; draw it as a round shape, or learn it "
+        "(`rfsg learn-shape`)",
+    )
+
+
+@torch.no_grad()
+def is_round(mesh: Mesh) -> bool:
+    """Whether most of the edges between faces, by length, are too blunt to be the thing's own."""
+    pair = mesh.face[mesh.sides]
+    normal = mesh.planes()[pair, :3]
+    blunt = (normal[:, 0] * normal[:, 1]).sum(-1) > BLUNT
+    length = (mesh.vertices[mesh.ends[:, 0]] - mesh.vertices[mesh.ends[:, 1]]).norm(dim=-1)
+    length = torch.where(pair[:, 0] != pair[:, 1], length, 0.0)
+    return float(length[blunt].sum()) > 0.5 * float(length.sum())
+
+
+BLUNT = math.cos(math.radians(20.0))  # no edge that diffracts
 
 
 def _close_radios(world: World, wavelength: float) -> str:

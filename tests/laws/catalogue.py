@@ -9,12 +9,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from rfsg.objects.contract import Contact, Crossing, Shape, Surface
 from rfsg.objects.shapes.analytic import Box, Capsule, Cylinder, HalfSpace, Sphere
+from rfsg.objects.shapes.mesh import Mesh
 from rfsg.objects.shapes.neural import NeuralShape, compute_lipschitz
+from rfsg.objects.shapes.polygons import triangles_of
 from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.solid import Solid
@@ -39,6 +42,29 @@ TWO_LOBES = {
     "alpha_i": 3,
     "forward_share": 0.7,
 }
+
+
+def angle_iron() -> Mesh:
+    """An L of two arms along z: eight faces, one of its edges inward."""
+    outline = [(-0.3, -0.3), (0.4, -0.3), (0.4, -0.1), (0.0, -0.1), (0.0, 0.35), (-0.3, 0.35)]
+    return extruded(outline, 0.25)
+
+
+def prism() -> Mesh:
+    """A slanted one, of five faces, convex; as its triangles lie in space, no face is along an axis."""
+    made = extruded([(-0.4, -0.3), (0.5, -0.2), (0.0, 0.4)], 0.3)
+    tilt = torch.linalg.qr(torch.randn(3, 3, generator=_generator(6)).to(F64))[0]
+    return Mesh(made.vertices @ tilt, made.triangles)
+
+
+def extruded(outline: list[tuple[float, float]], half: float) -> Mesh:
+    """A prism over a polygon, |z| <= half [m], from the polygons of its faces."""
+    n = len(outline)
+    ring = np.array([[x, y, z] for z in (-half, half) for x, y in outline])
+    sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
+    faces = [list(range(n))[::-1], list(range(n, 2 * n)), *sides]
+    count, index = np.array([len(f) for f in faces]), np.concatenate(faces)
+    return Mesh(ring, triangles_of(ring, count, index))
 
 
 @cache
@@ -85,6 +111,7 @@ SHAPES: dict[str, dict[str, Callable[[], Shape]]] = {
     "cylinder": {"": lambda: Cylinder(0.35, 0.15)},
     "capsule": {"": lambda: Capsule(0.2, 0.3)},
     "halfspace": {"": HalfSpace},
+    "mesh": {"": angle_iron, "prism": prism},
     "neural": {"": lumpy, "cabinet": cabinet},
 }
 SURFACES: dict[str, dict[str, Callable[[], Surface]]] = {

@@ -168,8 +168,8 @@ def test_guide_and_proxy_are_not_there(scene_file):
 
 
 def test_a_mesh_with_a_radio_material_is_refused_with_advice(scene_file):
-    with pytest.raises(SceneError, match="/World/Thing: a Mesh with a radio material.*learn-shape"):
-        Scene.from_usd(scene_file(known("Mesh", "")))
+    with pytest.raises(SceneError, match="/World/Thing: a Cone with a radio material.*learn-shape"):
+        Scene.from_usd(scene_file(known("Cone", "")))
 
 
 def test_a_slip_in_an_attribute_is_a_warning_with_the_likely_name(scene_file):

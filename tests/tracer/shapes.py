@@ -11,6 +11,7 @@ class Field(nn.Module):
 
     kind = "field"
     convex = False
+    faceted = False
     exact = False
 
     def __init__(self, f, half, lipschitz: float = 1.5):

@@ -28,6 +28,7 @@ class Analytic(nn.Module):
     kind: str
     lipschitz: float = 1.0
     convex: bool = True
+    faceted: bool = False
     exact: bool = True
 
     def sdf(self, point: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
@@ -60,6 +61,7 @@ class Box(Analytic):
     """
 
     kind = "box"
+    faceted = True
 
     def __init__(self, half_size: Sequence[float] | Tensor):
         super().__init__()
@@ -300,6 +302,7 @@ class HalfSpace(Analytic):
     """Everything below the plane z = 0: ground, or a very thick wall. Unbounded."""
 
     kind = "halfspace"
+    faceted = True
     _bounds: Tensor
     _planes: Tensor
 

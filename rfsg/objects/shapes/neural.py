@@ -38,6 +38,7 @@ class NeuralShape(nn.Module):
 
     kind = "neural"
     convex = False
+    faceted = False
     exact = False
     _bounds: Tensor
     _centre: Tensor

@@ -23,6 +23,7 @@ from rfsg.scene.usd.composition import is_prim_path, unit_faults
 from rfsg.scene.usd.faults import PXR_ERRORS, attempt, one_line, pxr_words, quiet
 from rfsg.scene.usd.layers import asset_path, open_stage
 from rfsg.scene.usd.materials import Materials
+from rfsg.scene.usd.meshes import read_mesh, smoothed
 from rfsg.scene.usd.objects import WEIGHTS, asset_file, asset_metre, weights_bytes
 from rfsg.scene.usd.placements import Places, world_from_stage
 from rfsg.scene.usd.radios import Radios
@@ -111,6 +112,7 @@ class _Reader:
     warnings: list[str] = field(default_factory=list)
     nodes: list[Node] = field(default_factory=list)
     decor: list[str] = field(default_factory=list)
+    cages: list[str] = field(default_factory=list)
     weights: dict[tuple[str, str], Body] = field(default_factory=dict)
     bodies: dict[Any, Body] = field(default_factory=dict)
     places: Places = field(init=False)
@@ -156,6 +158,9 @@ class _Reader:
             self.warnings.append(
                 _named("prim(s) without radio material, not seen by waves", self.decor)
             )
+        if self.cages:
+            what = "mesh(es) to be subdivided, of which waves see the cage"
+            self.warnings.append(_named(what, self.cages))
         return Scene(
             tuple(self.nodes),
             tuple(self.radios.found["tx"]),
@@ -280,11 +285,13 @@ class _Reader:
             self.decor.append(str(prim.GetPath()))
             return
         kind = str(prim.GetTypeName())
+        if kind == "Mesh":
+            return self._mesh(prim, *said)
         if kind not in shapes.SIZES:
             raise SceneError(
                 [f"{prim.GetPath()}: a {kind} with a radio material; waves see "
-                 f"{', '.join(shapes.SIZES)} and neural objects. Make one of a closed mesh with "
-                 "`rfsg learn-shape`"]
+                 f"{', '.join(shapes.SIZES)}, closed Meshes and neural objects. Make one of a mesh "
+                 "with `rfsg learn-shape`"]
             )  # fmt: skip
         self._known(prim, kind.lower(), shapes.sizes_of(prim, self.time), said)
 
@@ -310,6 +317,18 @@ class _Reader:
         body = self.bodies.get(key) if key[0] else None
         if body is None:
             body = self.bodies[key] = Body(shape_class(token)(**lengths), surface).to(self.device)
+        self._stand(prim, body, placement.pose(), None)
+
+    def _mesh(self, prim: Usd.Prim, where: str, material: Material) -> None:
+        placement = self.places.placement(prim)
+        surface = self.materials.surface(prim, where, material)
+        key = (_shared(prim), "mesh", str(placement.scales), id(surface))
+        body = self.bodies.get(key) if key[0] else None
+        if body is None:
+            shape = read_mesh(prim, self.time, placement.scales)
+            body = self.bodies[key] = Body(shape, surface).to(self.device)
+            if smoothed(prim):
+                self.cages.append(str(prim.GetPath()))
         self._stand(prim, body, placement.pose(), None)
 
     def _stand(self, prim: Usd.Prim, body: Body, pose: Pose, asset: str | None) -> None:

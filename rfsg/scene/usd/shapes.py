@@ -10,6 +10,7 @@ from rfsg.scene.fields import SHAPE
 from rfsg.scene.scene import SceneError
 from rfsg.scene.transforms import Placement
 from rfsg.scene.usd.attributes import author
+from rfsg.scene.usd.meshes import author_mesh
 
 # the prims that are known shapes, with the attributes that size them
 SIZES = {
@@ -31,6 +32,7 @@ PRIM_TYPES = {
     "cylinder": "Cylinder",
     "capsule": "Capsule",
     "halfspace": "Xform",
+    "mesh": "Mesh",
 }
 
 
@@ -76,7 +78,9 @@ def measure(
 
 def author_shape(prim: Usd.Prim, shape: Any) -> np.ndarray:
     """Author the sizes of a known shape; returns the stretch that its transform carries (boxes)."""
-    lengths = shape.config()
+    lengths = {} if shape.kind == "mesh" else shape.config()
+    if shape.kind == "mesh":
+        author_mesh(prim, shape)
     if shape.kind == "halfspace":
         author(prim, {SHAPE: "halfspace"})
     if "radius" in lengths:

@@ -10,18 +10,20 @@ import torch
 import trimesh
 from torch.autograd import gradcheck
 
-from rfsg.objects.shapes import edges as module
 from rfsg.objects.shapes.analytic import Box, Capsule, Cylinder, HalfSpace, Sphere
 from rfsg.objects.shapes.edges import (
     Edges,
     box_edges,
     cylinder_edges,
     edges_of,
+    learned,
     mesh_edges,
     no_edges,
 )
+from rfsg.objects.shapes.mesh import Mesh
 from rfsg.objects.shapes.neural import NeuralShape
 from rfsg.scene.assets import load_asset
+from tests.laws.catalogue import angle_iron
 
 F64 = torch.float64
 
@@ -130,7 +132,7 @@ def test_a_box_as_a_mesh(pieces):
     vertices, faces = mesh.vertices, mesh.faces
     if pieces == "every triangle for itself":
         vertices, faces = vertices[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-    edges = mesh_edges(np.array(vertices), np.array(faces))
+    edges = edges_of(Mesh(vertices, faces))
     assert len(edges) == 12
     gap, angle, met = _matched(edges, box_edges(torch.tensor([0.3, 0.5, 0.7], dtype=F64)))
     assert met == 12 and gap < 1e-12 and angle < 1e-5
@@ -150,7 +152,7 @@ def _sources() -> dict:
 def test_inner_edges_are_left_out():
     """A cabinet on a plinth set back: 12 + 8 convex edges, and 4 concave ones that are not."""
     mesh = _sources()["cabinet"]()
-    edges = mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
+    edges = edges_of(Mesh(mesh.vertices, mesh.faces))
     assert len(edges) == 20
     torch.testing.assert_close(edges.opening, torch.full((20,), 1.5, dtype=F64))
     lengths = (edges.end - edges.start).norm(dim=-1).sort().values
@@ -161,7 +163,7 @@ def test_inner_edges_are_left_out():
 def test_the_rims_of_a_tessellated_cylinder():
     """32 pieces each, at 90 degrees; the side turns by 11 degrees from facet to facet: no edges."""
     mesh = trimesh.creation.cylinder(radius=0.4, height=1.0, sections=32)
-    edges = mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
+    edges = edges_of(Mesh(mesh.vertices, mesh.faces))
     assert len(edges) == 64
     torch.testing.assert_close(edges.opening, torch.full((64,), 1.5, dtype=F64))
     chord = 2 * 0.4 * math.sin(math.pi / 32)
@@ -169,7 +171,7 @@ def test_the_rims_of_a_tessellated_cylinder():
         (edges.end - edges.start).norm(dim=-1), torch.full((64,), chord, dtype=F64)
     )
     fine = trimesh.creation.cylinder(radius=0.4, height=1.0, sections=1000)
-    edges = mesh_edges(np.array(fine.vertices), np.array(fine.faces))
+    edges = edges_of(Mesh(fine.vertices, fine.faces))
     middle = 0.5 * (edges.start + edges.end)
     out = middle * torch.tensor([1.0, 1.0, 0.0], dtype=F64)
     out = out / out.norm(dim=-1, keepdim=True)
@@ -177,32 +179,22 @@ def test_the_rims_of_a_tessellated_cylinder():
     assert float(radial.min()) > math.cos(math.radians(1.0))
 
 
-def test_a_sheet_is_a_half_plane_all_round():
-    vertices = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
-    edges = mesh_edges(vertices, np.array([[0, 1, 2], [0, 2, 3]]))
-    assert len(edges) == 4
-    torch.testing.assert_close(edges.opening, torch.full((4,), 2.0, dtype=F64))
-
-
-def test_smooth_and_empty_meshes_have_none():
+def test_a_smooth_mesh_has_none():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
-    assert len(mesh_edges(np.array(ball.vertices), np.array(ball.faces))) == 0
-    assert len(mesh_edges(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))) == 0
-    flat = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
-    assert len(mesh_edges(flat, np.array([[0, 1, 2]]))) == 0
-
-
-def test_what_is_no_mesh_is_refused(monkeypatch):
-    vertices, faces = np.eye(3), np.array([[0, 1, 2]])
-    with pytest.raises(ValueError, match="0 to 2"):
-        mesh_edges(vertices, faces + 1)
-    with pytest.raises(ValueError, match="not finite"):
-        mesh_edges(vertices * np.nan, faces)
+    assert len(edges_of(Mesh(ball.vertices, ball.faces))) == 0
     with pytest.raises(ValueError, match="angle_deg=0"):
-        mesh_edges(vertices, faces, 0.0)
-    monkeypatch.setattr(module, "MAX_TRIANGLES", 0)
-    with pytest.raises(ValueError, match="1 triangles"):
-        mesh_edges(vertices, faces)
+        mesh_edges(Mesh(ball.vertices, ball.faces), 0.0)
+
+
+def test_edges_of_a_mesh_follow_its_vertices():
+    ell = angle_iron()
+
+    def ends(vertices):
+        ell._parameters["vertices"] = vertices
+        edges = edges_of(ell)
+        return edges.start, edges.end, edges.normal0, edges.normal1
+
+    assert gradcheck(ends, (ell.vertices.detach().clone().requires_grad_(True),))
 
 
 # learned shapes
@@ -218,7 +210,7 @@ def _learned(name: str) -> NeuralShape:
 
 def _true(name: str) -> Edges:
     mesh = _sources()[name]()
-    return mesh_edges(np.array(mesh.vertices), np.array(mesh.faces))
+    return edges_of(Mesh(mesh.vertices, mesh.faces))
 
 
 def test_the_edges_of_the_learned_cabinet(monkeypatch):
@@ -229,7 +221,7 @@ def test_the_edges_of_the_learned_cabinet(monkeypatch):
     gap, angle, met = _matched(edges, _true("cabinet"))
     assert met == 20 and gap < 1e-3 and angle < 0.5
     others = no_edges()
-    monkeypatch.setattr(module, "_find", lambda *_: others)
+    monkeypatch.setattr(learned, "_find", lambda *_: others)
     assert edges_of(shape) is edges  # kept
     with torch.no_grad():
         shape.to_value.bias.add_(0.01)

@@ -1,0 +1,98 @@
+"""Closed meshes in USD: polygons become the triangles of a ``Mesh``, and back."""
+
+import numpy as np
+import torch
+from numpy import ndarray
+from pxr import Usd, UsdGeom, UsdShade, Vt
+
+from rfsg.objects.shapes.mesh import Mesh
+from rfsg.objects.shapes.polygons import triangles_of
+from rfsg.objects.shapes.topology import MAX_TRIANGLES
+from rfsg.scene.fields import MESH_POINTS
+from rfsg.scene.scene import SceneError
+from rfsg.scene.usd.attributes import author, values_of
+
+
+def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray) -> Mesh:
+    """The shape of a mesh prim, ``scales`` [3] absorbed. Raises SceneError for what is no solid."""
+    where = str(prim.GetPath())
+    point, count, index = (_array(prim, name, time) for name in NAMES)
+    if faults := _amiss(point, count, index):
+        raise SceneError([f"{where}: {fault}" for fault in faults])
+    _refuse_subsets(prim)
+    exact = values_of(prim, time, MESH_POINTS)[MESH_POINTS.name]
+    # what another program moved since is where that program put it
+    if exact is not None and np.array_equal(exact.astype(np.float32), point.astype(np.float32)):
+        point = exact
+    try:
+        return Mesh(point * scales, triangles_of(point, count, index))
+    except ValueError as error:
+        raise SceneError(
+            [f"{where}: no solid for waves: {error}. A shape that is not closed can be repaired and "
+             "learned with `rfsg learn-shape`"]
+        ) from error  # fmt: skip
+
+
+NAMES = ("points", "faceVertexCounts", "faceVertexIndices")
+
+
+def smoothed(prim: Usd.Prim) -> bool:
+    """Whether a mesh is the cage of a subdivision surface, which is read as it stands."""
+    scheme = UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr()
+    return scheme.HasAuthoredValue() and scheme.Get() != UsdGeom.Tokens.none
+
+
+def _array(prim: Usd.Prim, name: str, time: Usd.TimeCode) -> ndarray:
+    value = prim.GetAttribute(name).Get(time)
+    empty = np.zeros((0, 3)) if name == "points" else np.zeros(0, dtype=np.int64)
+    return empty if value is None else np.array(value).astype(empty.dtype)
+
+
+def _amiss(point: ndarray, count: ndarray, index: ndarray) -> list[str]:
+    """What is wrong with the arrays, before anything is made of them."""
+    if not len(count):
+        return ["a mesh without faces; a mesh of waves is closed"]
+    if count.min() < 3 or int(count.sum()) != len(index):
+        return [
+            f"faceVertexCounts name {int(count.sum())} corners, at least {int(count.min())} a face; "
+            f"expected the {len(index)} of faceVertexIndices, 3 or more a face"
+        ]
+    if index.min() < 0 or index.max() >= len(point):
+        return [
+            f"faceVertexIndices go from {index.min()} to {index.max()}; there are {len(point)} points"
+        ]
+    if not np.isfinite(point).all():
+        return ["points hold numbers that are not finite"]
+    triangles = int((count - 2).sum())
+    if triangles > MAX_TRIANGLES:
+        return [
+            f"{triangles} triangles; expected {MAX_TRIANGLES} at most. Divide the mesh into objects, "
+            "or learn it as a neural object with `rfsg learn-shape`"
+        ]
+    return []
+
+
+def _refuse_subsets(prim: Usd.Prim) -> None:
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
+        bound, _ = UsdShade.MaterialBindingAPI(subset).ComputeBoundMaterial("radio")
+        own = UsdShade.MaterialBindingAPI(subset).GetDirectBinding("radio").GetMaterial()
+        own = own or UsdShade.MaterialBindingAPI(subset).GetDirectBinding().GetMaterial()
+        if bound and own and own.GetPrim().GetAttribute("rfsg:material:model").HasAuthoredValue():
+            raise SceneError(
+                [f"{subset.GetPath()}: a radio material on a part of a mesh; an object has one. "
+                 "Divide the mesh by material"]
+            )  # fmt: skip
+
+
+def author_mesh(prim: Usd.Prim, shape: Mesh) -> None:
+    """Points in single precision, as USD meshes hold them, and beside them as they are if that is
+    not the same."""
+    point = shape.vertices.detach().cpu().to(torch.float64).numpy()
+    mesh, triangles = UsdGeom.Mesh(prim), shape.triangles.cpu().numpy()
+    single = np.ascontiguousarray(point, dtype=np.float32)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(single))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    if not np.array_equal(single.astype(np.float64), point):
+        author(prim, {MESH_POINTS: Vt.Vec3dArray.FromNumpy(point)})
