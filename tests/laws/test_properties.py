@@ -28,9 +28,11 @@ from rfsg.tracer.channel import coefficients
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Status
 from rfsg.tracer.simulate import Result, simulate
+from tests.laws.catalogue import angle_iron
 from tests.scenes import radio, vector
 
 C = 299_792_458.0
+IRON = angle_iron()  # not convex
 # what is refracted through curved solids is looked for with rays, which may miss some
 QUALITY = Quality(depth=2, floor_db=-300.0, refraction=False)
 
@@ -79,6 +81,10 @@ class Thing:
         arguments = {
             "box": {"half_size": [a, b, c]},
             "halfspace": {},
+            "mesh": {
+                "vertices": IRON.vertices * vector(a, b, c),
+                "triangles": IRON.triangles,
+            },
             "sphere": {"radius": a},
             "cylinder": {"radius": a, "half_height": b},
             "capsule": {"radius": a, "half_height": b},
@@ -140,7 +146,7 @@ SURFACE = st.one_of(
         for kind, arguments in ARGUMENTS.items()
     )
 )
-PLANAR = ("box", "halfspace")
+PLANAR = ("box", "halfspace", "mesh")
 CURVED = ("sphere", "cylinder", "capsule")
 
 
