@@ -25,6 +25,7 @@ test-all: lint
 bench: .venv/.installed-dev
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/stability.py
+	$(BIN)/python benchmarks/mechanisms.py
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .

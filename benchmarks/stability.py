@@ -8,17 +8,13 @@ Prints every table; --write-docs also writes docs/stability.md. Ends with an err
 """
 
 import argparse
-import os
-import platform
 import sys
 import time
-from pathlib import Path
 
-import torch
 from extremes import matter, networks, places, waves
 from extremes.table import Section, markdown
+from machine import ROOT, measured_on, write_page
 
-ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "stability.md"
 TOPICS = (waves, matter, places, networks)
 
@@ -49,22 +45,6 @@ def sections(quick: bool) -> list[Section]:
     return found
 
 
-def machine(seconds: float) -> str:
-    """The machine, in one line."""
-    return (
-        f"Measured on {_processor()}, {torch.get_num_threads()} of {os.cpu_count()} cores, "
-        f"{platform.system()}, Python {platform.python_version()}, torch {torch.__version__}, in "
-        f"{seconds:.0f} s.\n"
-    )
-
-
-def _processor() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    models = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or "an unnamed processor"
-
-
 def main() -> None:
     """Measure, print, and write the page if asked to."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -75,16 +55,13 @@ def main() -> None:
         parser.error("--write-docs writes the whole page: leave out --quick")
     start = time.perf_counter()
     found = sections(options.quick)
-    line = machine(time.perf_counter() - start)
+    line = measured_on(time.perf_counter() - start)
     print(line)
     unexplained = [f"{s.title}: {r.case}: {r}" for s in found for r in s.unexplained()]
     if unexplained:
         sys.exit("bad rows without a footnote:\n" + "\n".join(unexplained))
     if options.write_docs:
-        beside = PAGE.with_name(PAGE.name + ".part")
-        beside.write_text("\n".join([HEAD, line, markdown(found)]).rstrip() + "\n")
-        beside.replace(PAGE)
-        print(f"written: {PAGE}")
+        write_page(PAGE, HEAD, line, markdown(found))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The files of a run: links, paths, channel, map and report; and the table of what a scene holds.
+"""The files of a run: links, paths, channel, map and report; and the tables of what a scene holds.
 
 Everything is written beside its final place and then renamed: a run that fails leaves nothing
 half-written behind, and nothing that is there is replaced unless it is asked for.
@@ -54,7 +54,6 @@ PATH_COLUMNS = (
     "interactions",
     "vertices",
 )
-ACT_WORDS = ("reflection", "diffraction", "scattering", "refraction_in", "refraction_out")  # by Act
 _PACKAGES = ("rfsg", "torch", "numpy", "scipy", "embreex", "usd-core", "manifold3d", "trimesh")
 
 
@@ -100,7 +99,7 @@ def write_paths(result: Any, file: Path) -> None:
 
     ``phase_rad`` is that of gain * exp(-j 2 pi f delay), in (-pi, pi]. Angles are in the world:
     departure along the travel from the transmitter, arrival from the receiver back to the wave.
-    ``interactions`` lists what happens in order along the path, in the words of ``ACT_WORDS`` and
+    ``interactions`` lists what happens in order along the path, in the words of ``records.Act`` and
     "penetration"; ``vertices`` is "x y z; x y z".
     """
     _write_table(file, PATH_COLUMNS, path_rows(result))
@@ -347,6 +346,24 @@ def parameter_table(scene: "Scene") -> list[dict[str, Any]]:
     ]
 
 
+def radio_table(scene: "Scene") -> list[dict[str, Any]]:
+    """One row per radio, transmitters first: its place [m], power, pattern and array."""
+    rows = [_radio_row("transmitter", radio) for radio in scene.transmitters]
+    return rows + [_radio_row("receiver", radio) for radio in scene.receivers]
+
+
+def short(value: Any) -> str:
+    """A value for a table: numbers to four digits."""
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _radio_row(role: str, radio: Any) -> dict[str, Any]:
+    power = f"{radio.power_dbm:g}" if role == "transmitter" else ""
+    row = {"path": radio.path, "role": role, "at [m]": _place(radio.position)}
+    row |= {"power [dBm]": power, "pattern": radio.pattern, "polarization": radio.polarization}
+    return row | {"array": "" if radio.array is None else radio.array}
+
+
 def _node_row(node: Any) -> dict[str, Any]:
     shape, surface = node.body.shape, node.body.surface
     low, high = _numpy(shape.bounds()) * float(node.pose.scale.detach())
@@ -357,8 +374,10 @@ def _node_row(node: Any) -> dict[str, Any]:
         "surface": surface.kind,
         "parameters": f"{_count(shape)} + {_count(surface)}",
         "size [m]": " x ".join(f"{x:.3g}" for x in high - low),
-        "at [m]": " ".join(f"{x:.3g}" for x in _numpy(node.pose.translation)),
-        "settings": " ".join(f"{k}={_short(v)}" for k, v in config.items() if v is not None),
+        "at [m]": _place(node.pose.translation),
+        "settings": " ".join(
+            f"{k}={short(v).replace(' ', '')}" for k, v in config.items() if v is not None
+        ),
     }
 
 
@@ -366,20 +385,22 @@ def _count(module: Any) -> int:
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def _short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value).replace(" ", "")
+def _place(point: Any) -> str:
+    return " ".join(f"{x:.3g}" for x in _numpy(point))
 
 
 def _interactions(
     scene: "Scene", acts: list[tuple[int, int]], crossed: list[tuple[int, int]]
 ) -> str:
     """What happens at vertices, as (act, node), and penetrations, as (segment, node), in order."""
+    from rfsg.tracer.records import Act
+
     words = []
     for segment in range(len(acts) + 1):
         words += [f"penetration({scene.nodes[i].path})" for s, i in crossed if s == segment]
         if segment < len(acts):
             act, node = acts[segment]
-            words.append(f"{ACT_WORDS[act]}({scene.nodes[node].path})")
+            words.append(f"{Act(act).word}({scene.nodes[node].path})")
     return " ".join(words) or "line_of_sight"
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import typer
 
-from rfsg import cli, parse
+from rfsg import cli
+from rfsg.cli import parse
 
 SCENE = """#usda 1.0
 (
@@ -65,6 +66,7 @@ def scene_file(tmp_path):
 @pytest.fixture
 def faked(monkeypatch, small_run, tmp_path):
     """The command line alone: the scene and the result are those made by hand."""
+    import rfsg.tracer.radiomap  # noqa: F401  it would keep the made-up simulate, if first loaded now
     from rfsg.scene.scene import Scene
 
     asked = {}

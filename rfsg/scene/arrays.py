@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from rfsg.scene.errors import SceneError
+from rfsg.scene.files import open_csv
 
 UNITS = ("wavelength", "m")
 MAX_ELEMENTS = 4096
@@ -91,16 +92,11 @@ class Array:
 
         Raises SceneError listing every fault with file and line."""
         path = Path(path)
-        try:
-            if path.stat().st_size > MAX_CSV_BYTES:
-                raise SceneError([f"{path}: larger than {MAX_CSV_BYTES} bytes"])
-            with path.open(newline="", encoding="utf-8-sig") as file:
-                lines = csv.reader(file, skipinitialspace=True)
-                if [c.strip() for c in next(lines, [])] != ["x", "y", "z"]:
-                    raise SceneError([f"{path}:1: expected the columns x, y, z"])
-                rows = [(lines.line_num, row) for row in lines if row]
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
-            raise SceneError([f"{path}: not a CSV file that can be read: {error}"]) from error
+        with open_csv(path, MAX_CSV_BYTES) as file:
+            lines = csv.reader(file, skipinitialspace=True)
+            if [c.strip() for c in next(lines, [])] != ["x", "y", "z"]:
+                raise SceneError([f"{path}:1: expected the columns x, y, z"])
+            rows = [(lines.line_num, row) for row in lines if row]
         places = [_place(row) for _, row in rows]
         faults = [
             f"{path}:{line}: expected three finite numbers, got {', '.join(row)[:60]!r}"

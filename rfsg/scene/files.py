@@ -6,11 +6,16 @@ nesting ends the process inside the USD parser. This does not bound composition 
 multiply): read untrusted scenes in a child process with limits on time and memory.
 """
 
+import csv
 import os
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
+
+from rfsg.scene.errors import SceneError
 
 MARKER = "rfsg-assets.toml"  # a file of this name makes its folder the root of the scenes below it
 LAYER_SUFFIXES = (".usda", ".usd", ".usdc", ".usdz")
@@ -35,6 +40,18 @@ def default_root(scene: Path) -> Path:
 
 def is_url(path: str) -> bool:
     return re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", path) is not None
+
+
+@contextmanager
+def open_csv(path: Path, limit: int) -> Iterator[TextIO]:
+    """A CSV file of at most ``limit`` bytes, open. SceneError for one that cannot be opened or read."""
+    try:
+        if path.stat().st_size > limit:
+            raise SceneError([f"{path}: larger than {limit} bytes"])
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            yield file
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SceneError([f"{path}: not a CSV file that can be read: {error}"]) from error
 
 
 def outer_file(path: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rfsg.scene.antennas import PATTERNS, POLARIZATIONS
+from rfsg.scene.files import open_csv
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import SceneError
 
@@ -61,13 +62,8 @@ def from_csv(path: str | Path, *, parent: str = "/World/Receivers") -> list[Radi
     Raises SceneError listing every fault with file, line and column.
     """
     path = Path(path)
-    try:
-        if path.stat().st_size > MAX_CSV_BYTES:
-            raise SceneError([f"{path}: larger than {MAX_CSV_BYTES} bytes"])
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            return _rows(csv.DictReader(file, skipinitialspace=True), path, parent)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise SceneError([f"{path}: not a CSV file that can be read: {error}"]) from error
+    with open_csv(path, MAX_CSV_BYTES) as file:
+        return _rows(csv.DictReader(file, skipinitialspace=True), path, parent)
 
 
 def _rows(reader: csv.DictReader, path: Path, parent: str) -> list[Radio]:

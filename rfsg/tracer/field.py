@@ -13,9 +13,10 @@ alike; an average of the two amplitudes would cancel at grazing, where they diff
 """
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
+from rfsg.objects.physics.fresnel import SPEED_OF_LIGHT
 from rfsg.scene.antennas import basis
 from rfsg.scene.radios import Radio, amplitude, field_components
 from rfsg.scene.world import World
@@ -29,8 +30,6 @@ from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Channel, Paths
 from rfsg.tracer.refract import indices, inside
 
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
-
 
 def channel(
     world: World,
@@ -41,13 +40,18 @@ def channel(
     frequency: Float[Tensor, "f"],
     quality: Quality,
     edges: Edges | None = None,
+    through: Passages | None = None,
+    without: Bool[Tensor, "n"] | None = None,
 ) -> Channel:
     """The channel of exact paths at all frequencies. Paths through opaque objects have gain 0.
 
-    edges: those that the paths' DIFFRACT vertices number.
+    edges: those that the paths' DIFFRACT vertices number. through: what the paths go through, where
+    that is known; it is found otherwise. without: nodes whose coefficients are left out of unpolarised
+    gains, for a caller who knows them by heart or is about to learn them.
     """
     wavelength = SPEED_OF_LIGHT / frequency
-    through = passages(world, proxies, paths, float(wavelength.min()), quality)
+    if through is None:
+        through = passages(world, proxies, paths, float(wavelength.min()), quality)
     _, u = segments(paths.vertices)
     departure, arrival = u[:, 0], -_last(u, paths)
     scale = wavelength[None] / (4 * torch.pi) * paths.spread[:, None]
@@ -69,7 +73,7 @@ def channel(
         antennas = _patterns(transmitters, paths.tx, departure) * _patterns(
             receivers, paths.rx, arrival
         )
-        gain = _scalar(at, through) * antennas[:, None] * scale
+        gain = _scalar(at, through, without) * antennas[:, None] * scale
     blocked = torch.zeros(len(paths.tx), dtype=torch.bool, device=world.device)
     blocked[through.path[world.opaque[through.which]]] = True
     return Channel(
@@ -93,17 +97,23 @@ def _last(u: Tensor, paths: Paths) -> Tensor:
     return u[torch.arange(len(u), device=u.device), last]
 
 
-def _scalar(at: Acting, through: Passages) -> Complex[Tensor, "p f"]:
-    """Product of all scalar coefficients."""
+def _scalar(
+    at: Acting, through: Passages, without: Bool[Tensor, "n"] | None
+) -> Complex[Tensor, "p f"]:
+    """Product of all scalar coefficients, but for those of the nodes ``without``."""
     shape = (len(at.paths.tx), len(at.frequency))
     product = torch.ones(shape, dtype=torch.complex128, device=at.world.device)
     for level in range(at.paths.which.shape[1]):
         for i, act in at.vertices(level):
             factor = COEFFICIENT[act](at, i, level)
+            if without is not None:
+                factor = torch.where(without[at.paths.which[i, level], None], 1.0, factor)
             product = product * torch.ones_like(product).index_copy(0, i, factor)
     if len(through.path):
         factor = scalar(_transmission(at, through))
-        for slot in _slots(through.path):
+        if without is not None:
+            factor = torch.where(without[through.which, None], 1.0, factor)
+        for slot in slots(through.path):
             i = through.path[slot]
             product = product * torch.ones_like(product).index_copy(0, i, factor[slot])
     return product
@@ -113,7 +123,7 @@ def _transmission(at: Acting, through: Passages) -> Complex[Tensor, "m f 2"]:
     return at.world.transmission(through.which, through.crossing, at.frequency, through.last)
 
 
-def _slots(path: Int[Tensor, "m"]) -> list[Tensor]:
+def slots(path: Int[Tensor, "m"]) -> list[Tensor]:
     """The k-th entries of every path, for k = 0, 1, ...: each list names a path at most once."""
     order = torch.argsort(path, stable=True)
     first = torch.ones(len(path), dtype=torch.bool, device=path.device)
@@ -142,7 +152,7 @@ def _jones(
         if transmission is not None:
             here = torch.nonzero(through.segment == level).squeeze(-1)
             if len(here):
-                for slot in _slots(through.path[here]):
+                for slot in slots(through.path[here]):
                     field = _through(field, through, here[slot], u[:, level], transmission)
         if level < paths.which.shape[1]:
             for i, act in at.vertices(level):

@@ -16,13 +16,12 @@ from torch import Tensor
 
 from rfsg.objects.contract import Contact, Crossing
 from rfsg.objects.physics import utd
+from rfsg.objects.physics.fresnel import SPEED_OF_LIGHT
 from rfsg.scene.world import unit
 from rfsg.tracer.acting import Acting, crossing_normal, scalar
 from rfsg.tracer.edges import Edges, along_face
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.records import Act
-
-SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
 
 
 @dataclass(frozen=True)
@@ -209,7 +208,7 @@ def _pair(
     weights2: Weights,
     polarised: bool,
 ) -> tuple[Complex[Tensor, "m f 2 2"], Float[Tensor, "m f"]]:
-    """Two edges of one face: W_2 W_1 / 2 and the slopes' share (utd.along_face, with matrices)."""
+    """Two edges of one face: W_2 W_1 / 2 and the slopes' share; the equation stands in ``utd``."""
     first = _wedge(at, i, level - 1, torch.zeros_like(i, dtype=torch.bool))
     weights1 = _weights(at, at.paths.which[i, level - 1], first, polarised)
     w1 = _summed(utd.wedge_terms(*_arguments(at, first)), weights1)

@@ -169,9 +169,9 @@ def test_round_trip(tmp_path):
 
 
 def test_info_shows_arrays():
-    from rfsg.cli import _radio_row
+    from rfsg.report import radio_table
 
     radio = Radio.at("/r", 0, 0, 0, polarization="VH", array=Array.planar(4, 8))
-    row = {k: str(v) for k, v in _radio_row("transmitter", radio).items()}
-    assert row["array"] == "4 x 8, 0.5 x 0.5 wavelength" and row["polarization"] == "VH"
-    assert str(_radio_row("receiver", Radio.at("/r", 0, 0, 0))["array"]) == ""
+    row, plain = radio_table(Scene((), (radio,), (Radio.at("/s", 0, 0, 0),)))
+    assert str(row["array"]) == "4 x 8, 0.5 x 0.5 wavelength" and row["polarization"] == "VH"
+    assert plain["array"] == ""

@@ -27,42 +27,21 @@ from rfsg.tracer.simulate import Result, simulate
 from rfsg.tracer.tiles import curved_tiles, hashed
 from tests.scenes import box_node, radio, room_nodes
 from tests.tracer.shapes import Field, ball, two_walls
-
-FREQUENCY = 2.4e9
-FREE = (299_792_458.0 / FREQUENCY / (4.0 * math.pi)) ** 2  # (lambda / 4 pi)^2
-QUALITY = Quality(depth=1, diffuse=8, diffraction=0, floor_db=-300.0)
-LOBES = {
-    "lambertian": Scattering(1.0),
-    "directive": Scattering(1.0, "directive", alpha_r=4),
-    "narrow": Scattering(1.0, "directive", alpha_r=40),
-    "backscattering": Scattering(1.0, "backscattering", alpha_r=6, alpha_i=3, forward_share=0.6),
-}
-
-
-def real(value) -> Tensor:
-    return torch.tensor(value, dtype=torch.float64)
-
-
-def of_one(body: Body, tx, rx, quality: Quality = QUALITY, **options) -> Result:
-    """One object at the origin, one transmitter, receivers."""
-    pose, gradients = options.pop("pose", Pose.identity()), options.pop("gradients", False)
-    receivers = tuple(radio(f"/r{i}", *p, **options) for i, p in enumerate(rx))
-    scene = Scene((Node("/it", body, pose),), (radio("/t", *tx, **options),), receivers, FREQUENCY)
-    return simulate(scene, quality=quality, gradients=gradients)
-
-
-def ground(rough: Scattering | None = None) -> Body:
-    return Body(HalfSpace(), DielectricHalfSpace(eps_r=5.24, sigma=0.05, scattering=rough))
-
-
-def diffuse(result: Result) -> Tensor:
-    """Sum of |gain|^2 of the scattered paths of every link [t r], over (lambda / 4 pi)^2."""
-    t, r = len(result.scene.transmitters), len(result.scene.receivers)
-    i = torch.nonzero((result.paths.act == int(Act.SCATTER)).any(1)).squeeze(-1)
-    link = (result.paths.tx * r + result.paths.rx)[i]
-    gain = result.channel.gain[i, 0]
-    square = (gain.real**2 + gain.imag**2) / FREE
-    return torch.zeros(t * r, dtype=torch.float64).index_add(0, link, square).reshape(t, r)
+from tests.truths.rough import (
+    FREE,
+    FREQUENCY,
+    LOBES,
+    QUALITY,
+    at_phase_angles,
+    diffuse,
+    ground,
+    lambert_disc,
+    lambert_plane,
+    lambert_sphere,
+    of_one,
+    plain_sum,
+    real,
+)
 
 
 def mirrors(result: Result) -> int:
@@ -74,20 +53,18 @@ def mirrors(result: Result) -> int:
 
 @pytest.mark.parametrize(("low", "high"), [(1.0, 1.5), (1.0, 10.0), (0.1, 100.0)])
 def test_endless_lambertian_plane(low, high):
-    """One above the other: int h1 h2 / (pi d1^3 d2^3) dA = 2 / (h1 + h2)^2, twice the mirror's."""
     body = Body(HalfSpace(), Conductor(Scattering(1.0)))
     for count, error in ((8, 3e-3), (32, 3e-4)):
         quality = replace(QUALITY, diffuse=count)
         found = diffuse(of_one(body, (0, 0, low), [(0, 1e-9, high)], quality))
-        assert float(found) == pytest.approx(2.0 / (low + high) ** 2, rel=error)
+        assert float(found) == pytest.approx(lambert_plane(low, high), rel=error)
 
 
 def test_lambertian_disc():
-    """Both on the axis at h above a disc of radius a: (h^2 / 2) (1 / h^4 - 1 / (a^2 + h^2)^2); the
-    top of a cylinder, in tiles of straight lines."""
+    """The top of a cylinder, in tiles of straight lines."""
     h, a = 1.3, 0.9
     body = Body(Cylinder(a, 0.2), Conductor(Scattering(1.0)))
-    truth = 0.5 * h**2 * (h**-4 - (a * a + h * h) ** -2)
+    truth = lambert_disc(h, a)
     for count, error in ((8, 8e-3), (24, 2e-3)):
         quality = replace(QUALITY, diffuse=count)
         found = diffuse(of_one(body, (0, 0, 0.2 + h), [(0, 1e-9, 0.2 + h)], quality))
@@ -95,36 +72,12 @@ def test_lambertian_disc():
 
 
 def test_lambert_sphere():
-    """Far away at a phase angle b: (2 a^2 / 3 pi) (sin b + (pi - b) cos b) / D^4 (Lambert 1760)."""
-    a, far = 0.7, 1e4
-    angles = (0.01, 0.5, 1.2, 2.0, 2.8)
-    u = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64) / math.sqrt(14.0)
-    v = torch.tensor([2.0, -1.0, 0.0], dtype=torch.float64) / math.sqrt(5.0)
-    rx = [(far * (math.cos(b) * u + math.sin(b) * v)).tolist() for b in angles]
-    truth = [
-        2 * a * a / (3 * math.pi) * (math.sin(b) + (math.pi - b) * math.cos(b)) for b in angles
-    ]
+    a, angles = 0.7, (0.01, 0.5, 1.2, 2.0, 2.8)
+    truth = [lambert_sphere(a, b) for b in angles]
     for shape, error in ((Sphere(a), 4e-3), (Field(ball(a), [a + 0.05] * 3), 8e-3)):
         body = Body(shape, Conductor(Scattering(1.0)))
-        found = diffuse(of_one(body, (far * u).tolist(), rx)) * far**4
-        assert found[0].tolist() == pytest.approx(truth, rel=error)
-
-
-def plain_sum(rough: Scattering, tx, rx, half, count: int = 500) -> float:
-    """The plain twin: midpoints on a rectangle z = 0, everything at every point."""
-    x, y = (h * ((2 * np.arange(count) + 1) / count - 1) for h in half)
-    px, py = np.meshgrid(x, y, indexing="ij")
-    point = torch.from_numpy(np.stack([px.ravel(), py.ravel(), 0 * px.ravel()], -1))
-    n = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64).expand_as(point)
-    a, b = point - torch.tensor(tx, dtype=torch.float64), torch.tensor(rx) - point
-    d1, d2 = a.norm(dim=-1), b.norm(dim=-1)
-    k, out = a / d1[:, None], b / d2[:, None]
-    cosine = -k[:, 2]
-    eps = media.from_constants(real(5.24), real(0.05), real(FREQUENCY))
-    te, tm = fresnel.interface(cosine, eps.expand(len(cosine)))
-    reflected = 0.5 * (te.abs() ** 2 + tm.abs() ** 2)
-    area = 4.0 * half[0] * half[1] / count**2
-    return float((cosine * reflected * rough.density(k, out, n) / (d1 * d2) ** 2).sum() * area)
+        found = at_phase_angles(body, angles)
+        assert found.tolist() == pytest.approx(truth, rel=error)
 
 
 @pytest.mark.parametrize("kind", LOBES)

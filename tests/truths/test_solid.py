@@ -6,57 +6,28 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import brentq
-from scipy.special import j0
 
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Box, HalfSpace, Sphere
 from rfsg.objects.surfaces.interface import Conductor
-from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.solid import Solid
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
 from tests.scenes import box_node, radio
-
-C = 299_792_458.0
-EPS0 = 8.8541878188e-12
-DIRECT = Quality(depth=0, diffraction=0, floor_db=-300.0)
-CONCRETE = {"eps_r": 5.24, "sigma": 0.15}
-WALLS = {"slab": lambda d: Slab(d, **CONCRETE), "solid": lambda d: Solid(**CONCRETE)}
-
-
-def eps_of(f, eps_r=5.24, sigma=0.15):
-    return eps_r - 1j * sigma / (2 * math.pi * f * EPS0)
-
-
-def wall_scene(surface, angle_deg, thickness=0.1, half_way=3.0, polarization="none"):
-    """Through a wide wall across x at an angle; the plane of incidence is level, so V is TE."""
-    lean = half_way * math.tan(math.radians(angle_deg))
-    node = box_node("/wall", (0, 0, 0), (thickness / 2, 500.0, 500.0), surface)
-    tx = radio("/t", -half_way, -lean, 0.0, polarization=polarization)
-    rx = radio("/r", half_way, lean, 0.0, polarization=polarization)
-    return Scene((node,), (tx,), (rx,))
-
-
-def transfer_matrix(sine, cosine, eps, d, f):
-    """(R, T face to face) for TE and TM, at k_t = k sine and k_n = k cosine: interface and
-    propagation matrices of waves to and fro multiplied out (Yeh, Optical Waves in Layered Media, 5.1)."""
-    k0 = 2 * math.pi * f / C
-    kappa = np.sqrt(eps - sine**2 + 0j)
-    kappa = np.where(kappa.imag > 0, -kappa, kappa)
-    out = []
-    for y0, y1 in ((cosine, kappa), (cosine, kappa / eps)):
-        enter = np.array([[y0 + y1, y0 - y1], [y0 - y1, y0 + y1]]) / (2 * y0)
-        leave = np.array([[y1 + y0, y1 - y0], [y1 - y0, y1 + y0]]) / (2 * y1)
-        way = np.exp(1j * k0 * d * kappa)
-        zero = np.zeros_like(way)
-        m = np.einsum(
-            "ij...,jk...,kl...->il...", enter, np.array([[way, zero], [zero, 1 / way]]), leave
-        )
-        out.append((m[1, 0] / m[0, 0], 1 / m[0, 0]))
-    return out
-
+from tests.truths.layers import (
+    DIRECT,
+    WALLS,
+    C,
+    eps_of,
+    second_term,
+    seen_at,
+    sommerfeld,
+    through,
+    transfer_matrix,
+    wall_scene,
+)
 
 # walls
 
@@ -108,67 +79,18 @@ def test_solid_wall_is_the_slab_of_its_thickness(angle, f):
     assert float(((solid.jones - slab.jones).abs() / size).max()) < 1e-12 * max(1.0, f / 2.4e9)
 
 
-def panels(low, high, count):
-    """Nodes and weights of Gauss's 20-point rule on each of many panels."""
-    x, w = np.polynomial.legendre.leggauss(20)
-    edge = np.linspace(low, high, count + 1)
-    half = 0.5 * np.diff(edge)[:, None]
-    return (edge[:-1, None] + half * (x + 1)).ravel(), (half * w).ravel()
-
-
-def sommerfeld(f, d, rho, height):
-    """exp(-jkr)/r through a layer of concrete, times r exp(+jkr): plane-wave spectrum, TE (Chew, Waves
-    and Fields in Inhomogeneous Media, Eq. 2.2.30). In the visible range k_rho = k sin a, beyond it
-    k_rho = k cosh b; Gauss-Legendre, which has settled: see the vacuum's own error."""
-    k = 2 * math.pi * f / C
-    count = 100 + int(k * math.hypot(rho, height) / 20)  # 20 nodes for at most 20 rad of phase
-    a, wa = panels(0.0, math.pi / 2, count)
-    b, wb = panels(0.0, 40.0 / (k * height), count)
-    sine = np.concatenate([np.sin(a), np.cosh(b)])
-    root = np.concatenate([np.cos(a) + 0j, -1j * np.sinh(b)])
-    weight = np.concatenate([wa + 0j, 1j * wb]) * sine
-    layer = (
-        transfer_matrix(sine, root, eps_of(f), d, f)[0][1] * np.exp(1j * k * d * root) if d else 1.0
-    )
-    spectrum = j0(k * rho * sine) * np.exp(-1j * k * height * root) * weight
-    r = math.hypot(rho, height)
-    return -1j * k * np.sum(spectrum * layer) * r * np.exp(1j * k * r)
-
-
-def relative(angle, f, d):
-    """T of the layer relative to free space, TE, at an angle [rad]."""
-    sine, cosine = np.sin(angle), np.cos(angle)
-    face_to_face = transfer_matrix(sine, cosine, eps_of(f), d, f)[0][1]
-    return face_to_face * np.exp(2j * math.pi * f / C * d * cosine)
-
-
-def second_term(angle, f, d, r):
-    """What follows T in the field of a point source: (j / 2 k r) times T's Laplacian on the sphere of
-    directions, for a spherical wave of order l falls short of its limit by j l (l + 1) / 2 k r
-    (Abramowitz and Stegun 10.1.9)."""
-    h = 1e-4
-    low, mid, high = (relative(np.float64(angle + s), f, d) for s in (-h, 0.0, h))
-    bend, slope = (low - 2 * mid + high) / h**2, (high - low) / (2 * h)
-    turning = bend if angle == 0 else slope / math.tan(angle)
-    return 1j / (4 * math.pi * f / C * r) * (bend + turning)
-
-
 @pytest.mark.parametrize("f", [2.4e9, 5.8e9, 28e9])
 @pytest.mark.parametrize("angle", [0.0, 40.0, 65.0])
 def test_wall_against_the_field_of_a_point_source(angle, f):
     """A wall's plane-wave T is the first term of a point source's field. What it leaves out is the
     second, of order 1 / (k r) times T's curvature (some d / r): with it, the integral is met."""
     d, half_way = 0.1, 6.0
-    height = 2 * half_way
-    rho = height * math.tan(math.radians(angle))
-    r = math.hypot(rho, height)
+    rho, height, r = seen_at(angle, half_way)
     assert abs(sommerfeld(f, 0.0, rho, height) - 1.0) < 1e-9  # the quadrature's own error
     exact = sommerfeld(f, d, rho, height)
     second = second_term(math.radians(angle), f, d, r)
-    free = C / f / (4 * math.pi * r) * np.exp(-2j * math.pi * ((f * r / C) % 1.0))
     for make in WALLS.values():
-        result = simulate(wall_scene(make(d), angle, d, half_way, "V"), f, DIRECT)
-        found = complex(result.transfer()[0, 0, 0]) / free
+        found = through(make(d), angle, f, d, half_way)
         assert abs(found - exact) < 1.1 * abs(second)
         assert abs(found + second - exact) < 2.0 * abs(second) ** 2 / abs(exact) + 1e-6
 

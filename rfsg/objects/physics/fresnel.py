@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
-SPEED_OF_LIGHT = 299792458.0  # [m/s]
+SPEED_OF_LIGHT = 299_792_458.0  # [m/s], exact (SI)
 # A wave within a nanoradian of the surface is taken at a nanoradian: the limits are reached to 1e-9
 # there, and 0/0 (vacuum at exactly grazing incidence) cannot occur.
 GRAZING_COSINE = 1e-9

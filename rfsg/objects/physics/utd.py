@@ -37,8 +37,8 @@ Reflection coefficients here multiply the soft and the hard field: a conductor h
 ``rfsg.objects.contract`` are (TE, TM) with R_TE = R_TM at normal incidence, a conductor (-1, -1). For
 rays across the edge (beta0 = 90 deg) the plane of incidence of both faces is the plane across the
 edge, and R_soft = R_TE, R_hard = -R_TM; T_soft = T_TE, T_hard = T_TM. For other beta0 a conductor
-keeps (-1, +1), while a dielectric mixes the two components: weigh ``wedge_terms`` with 2 x 2 matrices
-where that matters.
+keeps (-1, +1), while a dielectric mixes the two components: ``wedge_terms`` are weighed with 2 x 2
+matrices there.
 
 **What a penetrable wedge transmits** (Burnside and Burgener, IEEE Trans. AP 31(1), 1983): where the
 direct ray goes on behind the edge with a factor T, terms 1 and 2 carry 1 - T.
@@ -50,13 +50,26 @@ so that the total field has no kink there.
 
 **Grazing incidence.** At phi_in = 0 (or n pi) the direct ray and the reflection are one. The terms
 are the limit phi_in -> 0 where both rays count, as they do for a radio just above the face. A wave
-that arrives along a face *from another edge of it* is already their sum: ``along_face`` has the
-factor 1/2.
+that arrives along a face *from another edge of it* is already their sum: there the factor is 1/2.
+
+**Two edges of one face**, the ray of length d between them along it: the wave from edge 1 varies across
+edge 2, by dE/dn per metre, and adds (1 / (j k sin beta0)) dD/d phi_in . dE/dn (slope diffraction: Hwang
+and Kouyoumjian 1974; Andersen, IEEE Trans. AP 45(7), 1997). So
+
+    D = (1/2) [D_2 D_1 + D_2' D_1' / (j k d sin beta_1 sin beta_2)]  [m],
+
+D_1' = dD_1/d phi_out, D_2' = dD_2/d phi_in, azimuths counted *from the common face* at both edges. The
+soft field over a conductor goes by the slopes alone. The incident wave of edge 2 has its caustic at edge
+1 across the edges: s_in of edge 2 is d, and s_out of edge 1 too. R is held in the slopes: right for
+conductors, for other faces as heuristic as R at an edge is. Against a boundary integral, on a conducting
+screen of 2.3 wavelengths, within 0.6 % (soft) and 2 % (hard) of the free field, less at higher frequency;
+but 2 to 3 dB low where source, face and receiver lie in one plane, for transition zones then overlap.
 
 **Validity.** Exact for a conducting half plane and plane waves (n = 2). On conducting wedges lit by a
-line source the worst error about the edge is 1 % of the free field at L of half a wavelength, 3 % at
-0.2 and 8 % at 0.05, and falls as 1 / (k L) (eigenfunction series, tests). The edge must be long, and
-other edges far, against those lengths; R of lossy faces is a heuristic away from its boundaries.
+line source the worst error about the edge is 1 % of the free field at L of half a wavelength (1.7 % on
+one of 135 degrees), 8 % at 0.05, and falls as 1 / (k L) (eigenfunction series, docs/accuracy.md). The
+edge must be long, and other edges far, against those lengths; R of lossy faces is a heuristic away
+from its boundaries.
 """
 
 import math
@@ -77,31 +90,6 @@ _DEGREE = 40  # of Weideman's rational form: 1e-15 of relative error
 _NEAR = 0.1  # |delta|/2 below which even functions of it are their power series
 
 
-def transition(x: Float[Tensor, "*b"]) -> Complex[Tensor, "*b"]:
-    """F(x) = 2j sqrt(x) e^{jx} int_{sqrt x}^inf e^{-j u^2} du for x >= 0 ([KP] eq. 26).
-
-    F -> 1 for large x. F grows like sqrt(x) from 0, where its derivative is infinite: there the
-    gradient given is 0. Use ``cotangent_transition`` across a shadow boundary.
-    """
-    positive = x > 0
-    root = torch.where(positive, x, torch.ones_like(x)).sqrt()
-    root = torch.where(positive, root, torch.zeros_like(root))
-    return math.sqrt(math.pi) * _ROOT_J * root * erfcx_diagonal(root)
-
-
-def cotangent_transition(
-    delta: Float[Tensor, "*#b"], n: Float[Tensor, "*#b"], kl: Float[Tensor, "*#b"]
-) -> Complex[Tensor, "*b"]:
-    """cot(delta / 2n) F(2 kl sin^2(delta / 2)) for |delta| <= n pi, also at and near delta = 0.
-
-    ``delta`` is the angle from the shadow boundary, (pi +- beta) - 2 pi n N with N such that it is
-    smallest. It steps by 2 n sqrt(2 pi kl) e^{j pi/4} at 0 ([KP] eq. 33 is its limit), where its
-    sign is +1. Raises nothing; arguments broadcast.
-    """
-    value, _ = _term(delta, n, torch.sqrt(2.0 * kl))
-    return torch.sqrt(2.0 * math.pi * kl) * _ROOT_J * value
-
-
 def wedge_terms(
     phi_in: Float[Tensor, "*#b"],
     phi_out: Float[Tensor, "*#b"],
@@ -114,8 +102,8 @@ def wedge_terms(
     """The four terms of the diffraction coefficient [sqrt(m)], unweighted, for spherical waves.
 
     Angles [rad], distances along the rays [m], wavenumber k [rad/m]; arguments broadcast. The field
-    at the receiver is E_in(edge) . sum(weights terms) . ``spreading`` . exp(-j k s_out), with
-    weights 1 - T, 1 - T, R_0, R_n.
+    at the receiver is E_in(edge) . sum(weights terms) . sqrt(s_in / (s_out (s_in + s_out))) .
+    exp(-j k s_out), with weights 1 - T, 1 - T, R_0, R_n ([KP] eqs. 21, 25; ITU-R P.526-15 4.3).
     """
     delta, _, n, scale, sharpness = _boundaries(phi_in, phi_out, beta0, n, s_in, s_out, k)
     value, _ = _term(delta, n, sharpness)
@@ -149,85 +137,16 @@ def slope_terms(
     s_out: Float[Tensor, "*#b"],
     k: Float[Tensor, "*#b"],
 ) -> Complex[Tensor, "*b 4"]:
-    """Derivatives d/d phi_in of ``wedge_terms`` [sqrt(m) / rad], all else held."""
+    """Derivatives d/d phi_in of ``wedge_terms`` [sqrt(m) / rad], all else held.
+
+    Of the uniform terms themselves and so exact for the half plane; the customary csc^2 F_s form is
+    this to leading order near and far from a boundary. d/d phi_out is the same function with in and
+    out exchanged. Slopes serve where the amplitude is about linear over the width sqrt(L / k) of the
+    transition zone.
+    """
     delta, turn, n, scale, sharpness = _boundaries(phi_in, phi_out, beta0, n, s_in, s_out, k)
     _, slope = _term(delta, n, sharpness)
     return scale * turn * slope
-
-
-def wedge_coefficients(
-    phi_in: Float[Tensor, "*#b"],
-    phi_out: Float[Tensor, "*#b"],
-    beta0: Float[Tensor, "*#b"],
-    n: Float[Tensor, "*#b"],
-    s_in: Float[Tensor, "*#b"],
-    s_out: Float[Tensor, "*#b"],
-    k: Float[Tensor, "*#b"],
-    r0: Complex[Tensor, "*#b 2"],
-    rn: Complex[Tensor, "*#b 2"],
-    t: Complex[Tensor, "*#b 2"],
-) -> Complex[Tensor, "*b 2"]:
-    """D (soft, hard) [sqrt(m)] of a wedge ([KP] eq. 25; ITU-R P.526-15 section 4.3).
-
-    r0, rn: reflection (soft, hard) of faces 0 and n, -1 and +1 for a conductor. t: what the direct
-    ray keeps that goes through the wedge, 0 if opaque. See the module for signs and weights.
-    """
-    terms = wedge_terms(phi_in, phi_out, beta0, n, s_in, s_out, k)
-    return _weigh(terms, r0, rn, t)
-
-
-def slope_coefficients(
-    phi_in: Float[Tensor, "*#b"],
-    phi_out: Float[Tensor, "*#b"],
-    beta0: Float[Tensor, "*#b"],
-    n: Float[Tensor, "*#b"],
-    s_in: Float[Tensor, "*#b"],
-    s_out: Float[Tensor, "*#b"],
-    k: Float[Tensor, "*#b"],
-    r0: Complex[Tensor, "*#b 2"],
-    rn: Complex[Tensor, "*#b 2"],
-    t: Complex[Tensor, "*#b 2"],
-) -> Complex[Tensor, "*b 2"]:
-    """dD/d phi_in (soft, hard) [sqrt(m) / rad], with the distances, R and T held.
-
-    A wave whose amplitude varies across the edge, by dE/dn per metre towards growing phi_in, adds
-    (1 / (j k sin beta0)) dD/d phi_in . dE/dn . spreading . e^{-jks} (slope diffraction: Hwang and
-    Kouyoumjian 1974; Andersen, IEEE Trans. AP 45(7), 1997). The derivative is of the uniform D itself
-    and so exact for the half plane; the customary csc^2 F_s form is this to leading order near and
-    far from a boundary. d/d phi_out is the same function with in and out exchanged.
-
-    Valid where the amplitude is about linear over the width sqrt(L / k) of the transition zone.
-    """
-    terms = slope_terms(phi_in, phi_out, beta0, n, s_in, s_out, k)
-    return _weigh(terms, r0, rn, t)
-
-
-def along_face(
-    first: Complex[Tensor, "*#b 2"],
-    second: Complex[Tensor, "*#b 2"],
-    first_slope: Complex[Tensor, "*#b 2"],
-    second_slope: Complex[Tensor, "*#b 2"],
-    beta_first: Float[Tensor, "*#b"],
-    beta_second: Float[Tensor, "*#b"],
-    distance: Float[Tensor, "*#b"],
-    k: Float[Tensor, "*#b"],
-) -> Complex[Tensor, "*b 2"]:
-    """D (soft, hard) [m] of two edges with a face in common, the ray between them along that face.
-
-    D = (1/2) [D_1 D_2 + D_1' D_2' / (j k distance sin beta_1 sin beta_2)]: half, because what edge 1
-    sends along the face is incident wave and reflection in one. ``first_slope`` is dD_1/d phi_out,
-    ``second_slope`` dD_2/d phi_in, azimuths counted *from the common face* at both edges. The soft
-    field over a conductor goes by the slopes alone. Symmetric: reciprocal.
-
-    The incident wave of edge 2 has its caustic at edge 1 across the edges: s_in of edge 2 is
-    ``distance``, and s_out of edge 1 too. R is held in the slopes: right for conductors, for other
-    faces as heuristic as R at an edge is. Against a boundary integral, on a conducting screen of 2.3
-    wavelengths, within 0.6 % (soft) and 2 % (hard) of the free field, less at higher frequency; but 2 to
-    3 dB low where source, face and receiver lie in one plane, for transition zones then overlap.
-    """
-    b1, b2 = torch.sin(beta_first), torch.sin(beta_second)
-    reach = (k * distance * b1 * b2)[..., None]
-    return 0.5 * (first * second - 1j * first_slope * second_slope / reach)
 
 
 def mean_cosine(
@@ -242,48 +161,6 @@ def mean_cosine(
     places; on and, to first order, about a reflection boundary it is that of the reflected ray.
     """
     return (s_in * cos_in + s_out * cos_out) / (s_in + s_out)
-
-
-def spreading(s_in: Float[Tensor, "*#b"], s_out: Float[Tensor, "*#b"]) -> Float[Tensor, "*b"]:
-    """sqrt(s_in / (s_out (s_in + s_out))) [1/sqrt(m)]: straight edge, spherical wave ([KP] eq. 21)."""
-    return torch.sqrt(s_in / (s_out * (s_in + s_out)))
-
-
-def curved_spreading(
-    s_in: Float[Tensor, "*#b"],
-    s_out: Float[Tensor, "*#b"],
-    bend: Float[Tensor, "*#b"],
-    least: Float[Tensor, "*#b"] | float,
-) -> Complex[Tensor, "*b"]:
-    """Spreading [1/sqrt(m)] from a curved edge, spherical wave ([KP] eqs. 21, 22).
-
-    sqrt(rho / (s_out (rho + s_out))) with 1/rho = 1/s_in - bend, that is sqrt(s_in / (s_out q)) with
-    q = s_in + s_out - s_in s_out bend [m], and bend = n_e . (d_in - d_out) / (a sin^2 beta0) [1/m]
-    (``edge_bend``). At q = 0 the receiver is on a caustic: |q| is held above ``least`` [m]. Beyond it
-    (q < 0) the factor e^{j pi/2} is the phase of a line focus under exp(+j w t).
-    """
-    q = s_in + s_out - s_in * s_out * bend
-    beyond = q < 0
-    size = torch.where(beyond, -q, q)
-    size = torch.maximum(size, torch.as_tensor(least, dtype=q.dtype, device=q.device))
-    magnitude = torch.sqrt(s_in / (s_out * size))
-    zero = torch.zeros_like(magnitude)
-    return torch.complex(torch.where(beyond, zero, magnitude), torch.where(beyond, magnitude, zero))
-
-
-def edge_bend(
-    outward: Float[Tensor, "*#b 3"],
-    d_in: Float[Tensor, "*#b 3"],
-    d_out: Float[Tensor, "*#b 3"],
-    radius: Float[Tensor, "*#b"],
-    beta0: Float[Tensor, "*#b"],
-) -> Float[Tensor, "*b"]:
-    """n_e . (d_in - d_out) / (a sin^2 beta0) [1/m] of ``curved_spreading``; 0 for radius = inf.
-
-    outward: unit vector from the edge's centre of curvature to the edge point; d_in, d_out:
-    directions of travel before and after; radius a [m].
-    """
-    return (outward * (d_in - d_out)).sum(-1) / (radius * torch.sin(beta0) ** 2)
 
 
 # the terms
@@ -352,14 +229,6 @@ def _series(coefficients: tuple[float, ...], w: Tensor) -> tuple[Tensor, Tensor]
         slope = value + w * slope
         value = c + w * value
     return value, slope
-
-
-def _weigh(terms: Tensor, r0: Tensor, rn: Tensor, t: Tensor) -> Tensor:
-    direct = (terms[..., 0] + terms[..., 1])[..., None]
-    return (1.0 - t) * direct + r0 * terms[..., 2:3] + rn * terms[..., 3:4]
-
-
-# the complementary error function on the diagonal
 
 
 def erfcx_diagonal(z: Float[Tensor, "*b"], order: int = 0) -> Complex[Tensor, "*b"]:

@@ -21,11 +21,7 @@ MOST_FREQUENCIES = 10_000  # each is a whole evaluation of all paths
 
 def parse_frequency(text: str) -> float:
     """'2.44GHz', '868 MHz' or '2.44e9' in hertz."""
-    match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([kmgt]?hz)?\s*", text, re.IGNORECASE)
-    try:
-        value = float(match[1]) * UNITS[(match[2] or "hz").lower()] if match else 0.0
-    except ValueError:
-        value = 0.0
+    value = _quantity(text, UNITS)
     if not 0.0 < value < HIGHEST_CREDIBLE_HZ:
         raise typer.BadParameter(f"{text!r} is not a frequency; write for example 2.44GHz")
     return value
@@ -41,14 +37,20 @@ def parse_frequencies(texts: list[str]) -> list[float]:
 
 def parse_duration(text: str) -> float:
     """'10ms', '2.5 us' or '0.01' in seconds."""
-    match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([mun]?s)?\s*", text, re.IGNORECASE)
-    try:
-        value = float(match[1]) * SECONDS[(match[2] or "s").lower()] if match else 0.0
-    except ValueError:
-        value = 0.0
+    value = _quantity(text, SECONDS)
     if not 0.0 < value < math.inf:
         raise typer.BadParameter(f"{text!r} is not a duration; write for example 10ms")
     return value
+
+
+def _quantity(text: str, units: dict[str, float]) -> float:
+    """A number and one of the units, or none, in SI; 0 for what is neither."""
+    match = re.fullmatch(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*", text, re.IGNORECASE)
+    try:
+        number, unit = (float(match[1]), match[2].lower()) if match else (0.0, "")
+    except ValueError:
+        return 0.0
+    return number * (units.get(unit, 0.0) if unit else 1.0)
 
 
 def parse_numbers(text: str, count: int, what: str) -> tuple[float, ...]:

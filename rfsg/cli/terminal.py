@@ -37,10 +37,6 @@ def print_table(title: str, rows: list[dict[str, Any]]) -> None:
     (terminal if terminal.is_terminal else Console(width=200)).print(table, markup=False)
 
 
-def short(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
-
-
 @contextmanager
 def bar() -> Iterator[Callable[..., None]]:
     """progress(stage) or progress(stage, done, total, note): bars on stderr; quiet when piped.

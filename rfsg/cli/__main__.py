@@ -1,0 +1,5 @@
+"""``python -m rfsg.cli``, the same as ``rfsg``."""
+
+from rfsg.cli import main
+
+main()

@@ -1,0 +1,77 @@
+"""Options that several commands have, each written once."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rfsg.cli.parse import parse_frequency
+
+HERTZ = "NUMBER[Hz|kHz|MHz|GHz]"
+
+SceneFile = Annotated[Path, typer.Argument(help="A USD scene (.usda, .usdc, .usdz).")]
+AnyFile = Annotated[Path, typer.Argument(help="A USD scene, or one object's asset.")]
+Out = Annotated[Path, typer.Option("--out", "-o", help="Folder for the results.")]
+Frequency = Annotated[
+    float | None,
+    typer.Option(
+        parser=parse_frequency,
+        metavar=HERTZ,
+        help="Carrier frequency. Default: the scene's own.",
+    ),
+]
+Frequencies = Annotated[
+    list[str],
+    typer.Option(
+        "--frequency",
+        metavar=f"{HERTZ}[,...]",
+        help="Carrier frequencies, over one geometry: 2.4GHz,5GHz. Default: the scene's own.",
+    ),
+]
+Roots = Annotated[
+    list[Path],
+    typer.Option("--asset-root", metavar="FOLDER", help="Another folder the scene may read from."),
+]
+Variants = Annotated[
+    list[str],
+    typer.Option(
+        "--variant",
+        metavar="PRIM:SET=NAME",
+        help="Choose a variant for this run: /World/Door:state=open.",
+    ),
+]
+Time = Annotated[
+    float | None,
+    typer.Option(metavar="CODE", help="USD time code to read at. Default: the stage's start."),
+]
+Preset = Annotated[str, typer.Option("--quality", help="draft, standard or reference.")]
+Changes = Annotated[
+    list[str],
+    typer.Option("--set", metavar="FIELD=VALUE", help="Change one field of the quality: depth=2."),
+]
+Moves = Annotated[
+    list[str],
+    typer.Option(
+        "--move",
+        metavar="PATH=X,Y,Z",
+        help="Move an object by metres, from where it stands: /World/Cabinet=1.2,0,0.",
+    ),
+]
+Replacements = Annotated[
+    list[str],
+    typer.Option(
+        "--replace",
+        metavar="PATH=ASSET",
+        help="Put another asset in an object's place: /World/Cabinet=desk.usda.",
+    ),
+]
+Removals = Annotated[
+    list[str], typer.Option("--without", metavar="PATH", help="Leave an object out.")
+]
+Receivers = Annotated[
+    Path | None,
+    typer.Option(help="CSV table name,x,y,z in metres: receivers in place of the scene's."),
+]
+Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:1.")]
+Seed = Annotated[int, typer.Option(help="Seed of everything random; it is written down.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")]
