@@ -9,15 +9,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from rfsg.objects.contract import Contact, Crossing, Shape, Surface
 from rfsg.objects.shapes.analytic import Box, Capsule, Cylinder, HalfSpace, Sphere
-from rfsg.objects.shapes.mesh import Mesh
+from rfsg.objects.shapes.mesh import Mesh, extruded
 from rfsg.objects.shapes.neural import NeuralShape, compute_lipschitz
-from rfsg.objects.shapes.polygons import triangles_of
 from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.solid import Solid
@@ -55,16 +53,6 @@ def prism() -> Mesh:
     made = extruded([(-0.4, -0.3), (0.5, -0.2), (0.0, 0.4)], 0.3)
     tilt = torch.linalg.qr(torch.randn(3, 3, generator=_generator(6)).to(F64))[0]
     return Mesh(made.vertices @ tilt, made.triangles)
-
-
-def extruded(outline: list[tuple[float, float]], half: float) -> Mesh:
-    """A prism over a polygon, |z| <= half [m], from the polygons of its faces."""
-    n = len(outline)
-    ring = np.array([[x, y, z] for z in (-half, half) for x, y in outline])
-    sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
-    faces = [list(range(n))[::-1], list(range(n, 2 * n)), *sides]
-    count, index = np.array([len(f) for f in faces]), np.concatenate(faces)
-    return Mesh(ring, triangles_of(ring, count, index))
 
 
 @cache

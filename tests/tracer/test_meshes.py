@@ -10,7 +10,7 @@ import torch
 from rfsg.objects.body import Body
 from rfsg.objects.physics.lobes import Scattering
 from rfsg.objects.shapes.analytic import Box
-from rfsg.objects.shapes.mesh import Mesh
+from rfsg.objects.shapes.mesh import Mesh, extruded
 from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.solid import Solid
@@ -20,7 +20,6 @@ from rfsg.tracer.plan import Quality
 from rfsg.tracer.radiomap import radio_map
 from rfsg.tracer.records import Act
 from rfsg.tracer.simulate import Result, simulate
-from tests.laws.catalogue import extruded
 from tests.scenes import box_node, radio, room
 
 FREQUENCY = 2.4e9

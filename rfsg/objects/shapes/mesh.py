@@ -19,6 +19,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from rfsg.objects.contract import Jet
+from rfsg.objects.shapes.polygons import triangles_of
 from rfsg.objects.shapes.topology import LEVEL, closed_mesh
 
 CHUNK = 1_000_000  # pairs of a point and a triangle or an edge at a time: some 100 MB in all
@@ -367,6 +368,21 @@ class Mesh(nn.Module):
             float(self._heights(some).max()) <= 2.0 * LEVEL * size
             for some in self.vertices.split(step)
         )
+
+
+def extruded(outline: Sequence[tuple[float, float]], half_height: float) -> Mesh:
+    """The prism over a simple polygon of (x, y), in either sense, for |z| <= half_height [m].
+
+    Raises ValueError for an outline of fewer than three corners, and as ``Mesh`` does.
+    """
+    n = len(outline)
+    if n < 3:
+        raise ValueError(f"an outline of {n} corners: expected 3 or more")
+    ring = np.array([[x, y, z] for z in (-half_height, half_height) for x, y in outline])
+    sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
+    faces = [list(range(n))[::-1], list(range(n, 2 * n)), *sides]
+    count, index = np.array([len(f) for f in faces]), np.concatenate(faces)
+    return Mesh(ring, triangles_of(ring, count, index))
 
 
 def _beside(point: Tensor, start: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:

@@ -10,9 +10,9 @@ from torch.autograd import gradcheck
 
 from rfsg.objects.shapes import topology
 from rfsg.objects.shapes.analytic import Box
-from rfsg.objects.shapes.mesh import Mesh
+from rfsg.objects.shapes.mesh import Mesh, extruded
 from rfsg.objects.shapes.polygons import triangles_of
-from tests.laws.catalogue import angle_iron, extruded, prism
+from tests.laws.catalogue import angle_iron, prism
 
 F64 = torch.float64
 HALF = [0.3, 0.5, 0.7]
@@ -208,6 +208,8 @@ def test_what_is_no_solid_is_refused(monkeypatch):
         # the first triangle cut at a point of one side, and the gap filled by a line
         a, b, c = f[0]
         Mesh(sliver, np.concatenate([f[1:], [[a, 8, c], [8, b, c], [a, b, 8]]]))
+    with pytest.raises(ValueError, match="outline of 2 corners"):
+        extruded([(0.0, 0.0), (1.0, 0.0)], 1.0)
     with pytest.raises(ValueError, match="finite rows"):
         Mesh(v * np.nan, f)
     with pytest.raises(ValueError, match="outside of 0 to 7"):
