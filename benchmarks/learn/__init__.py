@@ -1,0 +1,1 @@
+"""Parts of benchmarks/learning.py: data sets, methods, results on disk, the page."""
