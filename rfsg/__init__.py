@@ -28,6 +28,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rfsg.learn.fit import Fitted as Fitted
+    from rfsg.learn.fit import fit as fit
+    from rfsg.learn.measurements import Measurements as Measurements
+    from rfsg.learn.predict import predict as predict
     from rfsg.objects.body import Body as Body
     from rfsg.scene.arrays import Array as Array
     from rfsg.scene.patterns import Pattern as Pattern
@@ -49,6 +53,8 @@ __version__ = "0.1.0"
 _HOME = {
     "Array": "rfsg.scene.arrays",
     "Body": "rfsg.objects.body",
+    "Fitted": "rfsg.learn.fit",
+    "Measurements": "rfsg.learn.measurements",
     "Node": "rfsg.scene.scene",
     "Pattern": "rfsg.scene.patterns",
     "Pose": "rfsg.scene.pose",
@@ -58,7 +64,9 @@ _HOME = {
     "Scene": "rfsg.scene.scene",
     "SceneError": "rfsg.scene.scene",
     "capacity": "rfsg.tracer.mimo",
+    "fit": "rfsg.learn.fit",
     "mimo": "rfsg.tracer.mimo",
+    "predict": "rfsg.learn.predict",
     "radio_map": "rfsg.tracer.radiomap",
     "radio_map_on": "rfsg.tracer.radiomap",
     "simulate": "rfsg.tracer.simulate",
@@ -67,6 +75,8 @@ _HOME = {
 __all__ = [
     "Array",
     "Body",
+    "Fitted",
+    "Measurements",
     "Node",
     "Pattern",
     "Pose",
@@ -76,7 +86,9 @@ __all__ = [
     "Scene",
     "SceneError",
     "capacity",
+    "fit",
     "mimo",
+    "predict",
     "radio_map",
     "radio_map_on",
     "simulate",

@@ -281,6 +281,38 @@ def comparison_figure(
     return figure
 
 
+def loss_figure(history: dict[str, list[float]], title: str = "") -> Figure:
+    """How a fit went: loss and its parts, and the error of each batch, step by step.
+
+    Thin lines are steps, thick ones the median of a hundredth of the run. Steps whose loss was not
+    finite were refused and are left out.
+    """
+    figure = Figure(figsize=(9.0, 4.2), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for i, (axes, name) in enumerate(
+        ((left, "data"), (left, "regularisation"), (right, "error_db"))
+    ):
+        value = np.asarray(history[name], dtype=np.float64)
+        step = np.flatnonzero(np.isfinite(value)) + 1
+        value = value[step - 1]
+        if not len(step) or not value.any():
+            continue
+        width = max(1, len(step) // 100)
+        whole = len(step) // width * width
+        middle = np.median(value[:whole].reshape(-1, width), axis=1)
+        axes.plot(step, value, linewidth=0.4, alpha=0.4, color=f"C{i}")
+        axes.plot(step[width - 1 : whole : width], middle, color=f"C{i}", label=name)
+        if (value > 0).all():
+            axes.set_yscale("log")
+    left.set(xlabel="step", ylabel="loss")
+    right.set(xlabel="step", ylabel="median error of a batch [dB]")
+    for axes in (left, right):
+        axes.grid(alpha=0.3)
+    left.legend(fontsize=8)
+    figure.suptitle(title)
+    return figure
+
+
 def draw_top(axes: Axes, scene: Scene) -> None:
     """Outlines of the objects from above [m], named where they are small; sets the limits.
 

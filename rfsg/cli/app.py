@@ -10,6 +10,7 @@ import typer
 from rfsg import __version__
 from rfsg.cli.assets import check, info, learn_shape
 from rfsg.cli.errors import INTERRUPTED, verdict
+from rfsg.cli.fit import fit
 from rfsg.cli.map import map_
 from rfsg.cli.simulate import simulate
 from rfsg.cli.terminal import say
@@ -20,6 +21,7 @@ COMMANDS: dict[str, Callable[..., None]] = {  # in the order of --help
     "check": check,
     "info": info,
     "learn-shape": learn_shape,
+    "fit": fit,
 }
 
 app = typer.Typer(

@@ -27,6 +27,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import functional as F
 
+from rfsg.learn.errors import LearnError as LearnError
 from rfsg.learn.soap import Soap
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Surface
@@ -50,10 +51,6 @@ Progress = Callable[[int, int, str], None]  # (steps done, steps in all, a word 
 
 class MeshError(ValueError):
     """A mesh that cannot become an object; says why, and what would help."""
-
-
-class LearnError(RuntimeError):
-    """A training that cannot begin, go on or be used."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,51 @@
+"""``rfsg fit`` from files to files, and what it says when it cannot."""
+
+import json
+
+import pytest
+
+from rfsg import cli
+from rfsg.scene.scene import Scene
+from tests.learn.rooms import halfspace, readings, room_with, thing
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A scene with a thing of known material, and what it gives."""
+    scene = room_with(thing(halfspace(4.0, 0.1)), count=8)
+    readings(scene, "rssi").to_csv(tmp_path / "readings.csv")
+    return str(scene.to_usd(tmp_path / "room.usda")), str(tmp_path / "readings.csv"), tmp_path
+
+
+def run(files, *options: str) -> int:
+    scene, csv, folder = files
+    standard = ["--out", str(folder / "out"), "--set", "depth=1", "--steps", "4"]
+    return cli.run(["fit", scene, csv, *standard, *options])
+
+
+def test_files_become_files(files, capsys):
+    select = ["--select", "/thing.surface", "--select", "power"]
+    assert run(files, *select, "--unknown", "/thing", "--validation", "0.25") == 0
+    said = capsys.readouterr().out
+    assert "/thing" in said and "validation, after" in said
+    out = files[2] / "out"
+    names = (
+        "scene.usda history.csv predictions.csv measurements.csv report.json loss.png errors.png"
+    )
+    assert all((out / name).stat().st_size > 0 for name in names.split())
+    assert json.loads((out / "report.json").read_text())["steps"] == 4
+    assert Scene.from_usd(out / "scene.usda").node("/thing").body.surface.kind == "stochastic"
+    assert run(files, *select, "--unknown", "/thing") != 0
+    assert "already exists" in capsys.readouterr().err
+    again = [*select, "--unknown", "/thing", "--validation", "0.25", "--resume", "--steps", "6"]
+    assert run(files, *again) == 0
+
+
+def test_what_cannot_be_learned_is_said(files, capsys):
+    assert run(files, "--select", "/thin") == 3
+    assert "near it: /thing" in capsys.readouterr().err
+    assert run(files, "--select", "/thing", "--unknown", "/nothing") == 3
+    assert "names no object" in capsys.readouterr().err
+    (files[2] / "readings.csv").write_text("tx,rx,rssi_dbm\n/tx,/rx0,loud\n")
+    assert run(files, "--select", "/thing") == 3
+    assert "readings.csv:2: rssi_dbm: expected a finite number" in capsys.readouterr().err
