@@ -13,6 +13,8 @@ from pathlib import Path
 from learn.cases import Case
 from rfsg.learn import baselines
 from rfsg.learn.baselines import Method
+from rfsg.learn.regions import RegionPhysics
+from rfsg.learn.residual import Part, Residual
 
 FOLDER = Path(baselines.__file__).parent
 
@@ -32,7 +34,10 @@ class Entry:
 
 
 def version(*names: str, budget: str = "") -> str:
-    """A digest of a budget and of the code of some modules of rfsg.learn.baselines, readings with them."""
+    """A digest of a budget and of the code of some modules, named from the folder of the baselines.
+
+    Readings are always with them.
+    """
     digest = hashlib.sha256(budget.encode())
     for name in (*names, "readings"):
         digest.update(code(FOLDER / f"{name}.py").encode())
@@ -88,8 +93,43 @@ def methods(nerf2_steps: int = 600) -> dict[str, Entry]:
             "log-distance, a Gaussian field over transmitter positions that all gateways share, one "
             "over transmitter and gateway positions together, and gateway offsets",
         ),
+        "log-distance + common": residual(
+            "common",
+            "one exponent for the network; what it leaves as levels and a field over transmitter "
+            "positions that all gateways share, and gateway offsets",
+        ),
+        "log-distance + residual": residual(
+            "whole", "the same, and a field over transmitter and gateway positions together"
+        ),
         "NeRF2": nerf2(nerf2_steps),
+        "rfsg physics": regions(),
     }
+
+
+def regions() -> Entry:
+    """There is no floor plan: regions, direct paths, offsets of power and gateways."""
+    method = RegionPhysics()
+    how = method.budget
+    budget = (
+        f"{how.steps} steps of {how.batch} readings, regions of {method.cell_m:g} m at most, rate "
+        f"{how.learning_rate:g}"
+    )
+    return Entry(
+        lambda case: method,
+        version("../regions", "../fit", "../training", "../losses", budget=repr(method)),
+        "direct paths through region objects that learn a loss, a level, and an offset per gateway",
+        budget,
+        baseline=False,
+    )
+
+
+def residual(answer: Part, said: str) -> Entry:
+    """A part of what ``Residual`` makes of the log-distance law; its offsets are the residual's."""
+    method = Residual(baselines.LogDistance(offsets=False), answer=answer)
+    ours = ("residual", "levels", "mixture")
+    base = ("kriging", "gaussian_process", "log_distance")
+    digest = version(*base, *(f"../{name}" for name in ours), budget=repr(method))
+    return Entry(lambda case: method, digest, said, baseline=False)
 
 
 def nerf2(steps: int) -> Entry:

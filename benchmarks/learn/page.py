@@ -38,7 +38,7 @@ def tables(results: Sequence[Result], methods: dict[str, Entry]) -> str:
         if unsure:
             parts += [
                 f"\n### {data_set}: coverage of the 90 % interval\n",
-                "Share of test readings inside, for the methods that give a standard deviation.\n",
+                "Share of test readings inside, for the methods that give an interval.\n",
                 grid(mine, unsure, covers),
             ]
         parts += [

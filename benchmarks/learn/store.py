@@ -11,6 +11,7 @@ import numpy as np
 from learn.cases import Case
 from learn.methods import Entry
 from rfsg.learn.baselines import Readings, UnheardGatewayError
+from rfsg.learn.mixture import interval_of
 from rfsg.learn.protocol import Score, absolute_error, score
 
 
@@ -65,9 +66,8 @@ def evaluate(case: Case, entry: Entry) -> Outcome:
         return Outcome(None, (), fitted - begin, 0.0)
     spent = time.perf_counter() - fitted
     error = absolute_error(test.rssi, said.mean).round(3)
-    return Outcome(
-        score(test.rssi, said.mean, said.std), tuple(error.tolist()), fitted - begin, spent
-    )
+    found = score(test.rssi, said.mean, said.std, interval=interval_of(said))
+    return Outcome(found, tuple(error.tolist()), fitted - begin, spent)
 
 
 def load(path: Path) -> Outcome:

@@ -13,7 +13,7 @@ from scipy.stats import norm
 class Score:
     """Absolute errors of received readings [dB], and the share of readings inside an interval.
 
-    ``coverage`` is None for a method without standard deviations.
+    ``coverage`` is None for a method without standard deviations or intervals.
     """
 
     readings: int
@@ -27,14 +27,20 @@ def score(
     mean: Float[ndarray, "n"],
     std: Float[ndarray, "n"] | None = None,
     level: float = 0.9,
+    interval: tuple[Float[ndarray, "n"], Float[ndarray, "n"]] | None = None,
 ) -> Score:
     """Median and 90th percentile of |measured - mean|; coverage of the central ``level`` interval.
+
+    The interval is that of a normal distribution with ``std``, unless its bounds are given.
 
     Raises ValueError when there is no reading or a value is not finite: a missing prediction must not
     leave the reading out of the score.
     """
     off = absolute_error(measured, mean)
-    covered = None if std is None else coverage(measured, mean, std, level)
+    if interval is not None:
+        covered = share_inside(measured, *interval)
+    else:
+        covered = None if std is None else coverage(measured, mean, std, level)
     return Score(len(off), float(np.median(off)), float(np.percentile(off, 90)), covered)
 
 
@@ -67,3 +73,10 @@ def coverage(
     """Share of readings inside the central ``level`` interval of a normal distribution."""
     half = float(norm.ppf(0.5 + level / 2.0)) * std
     return float((np.abs(measured - mean) <= half).mean())
+
+
+def share_inside(
+    measured: Float[ndarray, "n"], low: Float[ndarray, "n"], high: Float[ndarray, "n"]
+) -> float:
+    """Share of readings from ``low`` to ``high``, both included."""
+    return float(((low <= measured) & (measured <= high)).mean())

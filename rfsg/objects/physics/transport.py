@@ -164,6 +164,9 @@ def phasor(phi: Float[Tensor, "*b"]) -> Complex[Tensor, "*b"]:
     return torch.complex(phi.cos().clamp(min=0.0), phi.sin())
 
 
+IN_FACE = 1e-9  # [m] a stretch that runs in a face, but for rounding, is inside
+
+
 def telescoped(
     law: Law,
     f: Float[Tensor, "*b n"],
@@ -194,7 +197,7 @@ def telescoped(
     isotropic = (m_bar * mean_density + mean_hazard) * sharpness * slope
     along = 0.5 * (1 - alpha_bar) * isotropic
     if kappa is not None:
-        along = along + _mean(kappa * torch.where(f <= 0, log_o.exp(), 0.0))
+        along = along + _mean(kappa * torch.where(f <= IN_FACE, log_o.exp(), 0.0))
     return _symmetric_sum((across + along * step[..., None]) * phasor(phi_bar))
 
 
@@ -221,7 +224,7 @@ def riemann(
     sigma = sigma_inside(law, f.clamp(max=0.0), slope, m, sigma_mix(alpha, cosine), sharpness)
     if kappa is not None:
         sigma = sigma + kappa * law.occupancy(sharpness * f.clamp(max=0.0))
-    a = torch.where(f <= 0, sigma, 0.0) * phasor(phi)
+    a = torch.where(f <= IN_FACE, sigma, 0.0) * phasor(phi)
     return a[..., :-1].sum(-1) * step
 
 

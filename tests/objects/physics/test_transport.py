@@ -232,3 +232,17 @@ def test_bulk_loss_of_a_solid_is_its_length():
     kappa = torch.full_like(f, 0.7)
     a = transport.telescoped(*_stretch(law, f, alpha=1.0, s=1e3, step=0.25, kappa=kappa))
     assert float(a.real) == pytest.approx(0.7, rel=1e-12)
+
+
+@pytest.mark.parametrize("integral", sorted(transport.INTEGRALS))
+def test_a_stretch_in_a_face_loses_the_same_above_and_below_rounding(integral):
+    """Along a seam of turned boxes f is +-1e-16 m: half the bulk loss, as at 0, and not none."""
+    n, kappa, step = 5, 0.7, torch.tensor(0.3, dtype=F64)
+    gradient = torch.tensor([[0.0, 0.0, 1.0]], dtype=F64).expand(n, 3)
+    zero, along = torch.zeros(n, dtype=F64), torch.tensor([1.0, 0.0, 0.0], dtype=F64)
+    for f in (-1e-16, 0.0, 1e-16):
+        total = transport.INTEGRALS[integral](
+            LAWS["logistic"], torch.full((n,), f, dtype=F64), gradient, zero, zero + 1.0, zero,
+            torch.tensor(20.0, dtype=F64), along, step, torch.full((n,), kappa, dtype=F64),
+        )  # fmt: skip
+        assert float(total.real) == pytest.approx(0.5 * kappa * 0.3 * (n - 1), rel=1e-9)
