@@ -15,6 +15,7 @@ from torch import Tensor
 from rfsg.objects.body import Body
 from rfsg.objects.physics import media
 from rfsg.objects.physics.fresnel import SPEED_OF_LIGHT
+from rfsg.objects.shapes.edges import BLUNT_DEG
 from rfsg.objects.shapes.mesh import Mesh
 from rfsg.objects.shapes.presence import absence
 from rfsg.objects.surfaces.interface import Dielectric
@@ -155,13 +156,10 @@ def is_round(mesh: Mesh) -> bool:
     """Whether most of the edges between faces, by length, are too blunt to be the thing's own."""
     pair = mesh.face[mesh.sides]
     normal = mesh.planes()[pair, :3]
-    blunt = (normal[:, 0] * normal[:, 1]).sum(-1) > BLUNT
+    blunt = (normal[:, 0] * normal[:, 1]).sum(-1) > math.cos(math.radians(BLUNT_DEG))
     length = (mesh.vertices[mesh.ends[:, 0]] - mesh.vertices[mesh.ends[:, 1]]).norm(dim=-1)
     length = torch.where(pair[:, 0] != pair[:, 1], length, 0.0)
     return float(length[blunt].sum()) > 0.5 * float(length.sum())
-
-
-BLUNT = math.cos(math.radians(20.0))  # no edge that diffracts
 
 
 def _close_radios(world: World, wavelength: float) -> str:

@@ -74,10 +74,10 @@ def _amiss(point: ndarray, count: ndarray, index: ndarray) -> list[str]:
 
 def _refuse_subsets(prim: Usd.Prim) -> None:
     for subset in UsdGeom.Subset.GetAllGeomSubsets(UsdGeom.Imageable(prim)):
-        bound, _ = UsdShade.MaterialBindingAPI(subset).ComputeBoundMaterial("radio")
-        own = UsdShade.MaterialBindingAPI(subset).GetDirectBinding("radio").GetMaterial()
-        own = own or UsdShade.MaterialBindingAPI(subset).GetDirectBinding().GetMaterial()
-        if bound and own and own.GetPrim().GetAttribute("rfsg:material:model").HasAuthoredValue():
+        binding = UsdShade.MaterialBindingAPI(subset)
+        own = binding.GetDirectBinding("radio").GetMaterial()
+        own = own or binding.GetDirectBinding().GetMaterial()
+        if own and own.GetPrim().GetAttribute("rfsg:material:model").HasAuthoredValue():
             raise SceneError(
                 [f"{subset.GetPath()}: a radio material on a part of a mesh; an object has one. "
                  "Divide the mesh by material"]
@@ -88,11 +88,18 @@ def author_mesh(prim: Usd.Prim, shape: Mesh) -> None:
     """Points in single precision, as USD meshes hold them, and beside them as they are if that is
     not the same."""
     point = shape.vertices.detach().cpu().to(torch.float64).numpy()
-    mesh, triangles = UsdGeom.Mesh(prim), shape.triangles.cpu().numpy()
-    single = np.ascontiguousarray(point, dtype=np.float32)
-    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(single))
+    author_triangles(UsdGeom.Mesh(prim), point, shape.triangles.cpu().numpy())
+    if not np.array_equal(point.astype(np.float32).astype(np.float64), point):
+        author(prim, {MESH_POINTS: Vt.Vec3dArray.FromNumpy(point)})
+
+
+def author_triangles(mesh: UsdGeom.Mesh, point: ndarray, triangles: ndarray) -> None:
+    """Points and triangles of a mesh that is not to be subdivided."""
+    mesh.CreatePointsAttr(vectors(point))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(triangles.astype(np.int32).ravel()))
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    if not np.array_equal(single.astype(np.float64), point):
-        author(prim, {MESH_POINTS: Vt.Vec3dArray.FromNumpy(point)})
+
+
+def vectors(values: ndarray) -> Vt.Vec3fArray:
+    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, Vt
+from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom
 
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Shape
@@ -19,6 +19,7 @@ from rfsg.scene.usd.attributes import NEURAL_API, author
 from rfsg.scene.usd.composition import arcs, layer_of, metre_of, up_of
 from rfsg.scene.usd.faults import quiet
 from rfsg.scene.usd.layers import asset_bytes, asset_path, new_stage, open_stage
+from rfsg.scene.usd.meshes import author_triangles, vectors
 from rfsg.scene.weights import (
     FORMAT_VERSION,
     MAX_WEIGHTS_BYTES,
@@ -176,16 +177,9 @@ def _define_mesh(stage: Usd.Stage, path: str, mesh: Any, color: Sequence[float])
     if not (finite and inside and normals.shape == vertices.shape):
         raise SceneError([f"{path}: the mesh has bad indices, or normals or numbers amiss"])
     prim = UsdGeom.Mesh.Define(stage, path)
-    prim.CreatePointsAttr(_vectors(vertices))
-    prim.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(faces.astype(np.int32).ravel()))
-    prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    author_triangles(prim, vertices, faces)
     # faceVarying: Blender's importer takes custom normals from nothing else
-    prim.CreateNormalsAttr(_vectors(normals[faces.ravel()]))
+    prim.CreateNormalsAttr(vectors(normals[faces.ravel()]))
     prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
-    prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-    prim.CreateExtentAttr(_vectors(np.stack([vertices.min(0), vertices.max(0)])))
+    prim.CreateExtentAttr(vectors(np.stack([vertices.min(0), vertices.max(0)])))
     prim.CreateDisplayColorAttr([Gf.Vec3f(*(float(c) for c in color))])
-
-
-def _vectors(values: np.ndarray) -> Vt.Vec3fArray:
-    return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(values, dtype=np.float32))

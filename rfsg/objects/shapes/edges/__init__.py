@@ -6,12 +6,13 @@ faces that meet there. Sizes of shapes known exactly stay differentiable.
 
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.analytic import Box, Cylinder
-from rfsg.objects.shapes.edges.known import box_edges, cylinder_edges, mesh_edges
+from rfsg.objects.shapes.edges.known import BLUNT_DEG, box_edges, cylinder_edges, mesh_edges
 from rfsg.objects.shapes.edges.learned import learned_edges
 from rfsg.objects.shapes.edges.record import Edges, no_edges, straight_edges
 from rfsg.objects.shapes.mesh import Mesh
 
 __all__ = [
+    "BLUNT_DEG",
     "Edges",
     "box_edges",
     "cylinder_edges",

@@ -55,7 +55,10 @@ def cylinder_edges(radius: Float[Tensor, ""], half_height: Float[Tensor, ""]) ->
 STRAIGHT = 1e-3  # sine of the angle between pieces of one straight edge
 
 
-def mesh_edges(shape: Mesh, angle_deg: float = 20.0) -> Edges:
+BLUNT_DEG = 20.0  # what turns less is a facet of something round
+
+
+def mesh_edges(shape: Mesh, angle_deg: float = BLUNT_DEG) -> Edges:
     """The convex edges where a mesh turns by more than ``angle_deg``; pieces of one are joined.
 
     Patches are the mesh's own faces. Raises ValueError for an angle outside (0, 180).
