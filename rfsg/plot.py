@@ -43,6 +43,7 @@ _TX = "#c0392b"
 _RX = "#1f6fb2"
 _PATHS = "plasma_r"
 _MAP = "viridis"
+_ERROR = "RdBu_r"
 _NOTHING = "#d8d8d8"
 _BOX_EDGES = [(i, i + step) for step in (1, 2, 4) for i in range(8) if not i & step]
 
@@ -260,25 +261,69 @@ def comparison_figure(
     """Measured against predicted: a scatter of the first prediction, and the CDF of every error."""
     figure = Figure(figsize=(11.0, 4.8), layout="constrained")
     scatter, cdf = figure.subplots(1, 2)
-    for i, (name, values) in enumerate(predicted.items()):
-        error = np.sort(np.abs(values - measured))
-        share = np.arange(1, len(error) + 1) / max(1, len(error))
-        median, tail = np.percentile(error, (50, 90)) if len(error) else (np.nan, np.nan)
-        label = f"{name}: median {median:.1f} dB, 90 % {tail:.1f} dB"
-        cdf.step(error, share, where="post", label=label, color=f"C{i}")
-        if i == 0:
-            scatter.plot(measured, values, ".", markersize=3, alpha=0.35, color="C0", label=name)
+    _draw_cdf(cdf, {name: values - measured for name, values in predicted.items()})
+    for name, values in list(predicted.items())[:1]:
+        scatter.plot(measured, values, ".", markersize=3, alpha=0.35, color="C0", label=name)
     ends = np.concatenate([measured, *list(predicted.values())[:1]])
     if len(ends):
         scatter.plot(_ends(ends), _ends(ends), color="black", linewidth=0.8)
     scatter.set(xlabel=f"measured [{unit}]", ylabel=f"predicted [{unit}]", aspect="equal")
-    cdf.set(xlabel="absolute error [dB]", ylabel="share of measurements", ylim=(0, 1))
-    cdf.set_xlim(left=0)
-    for axes in (scatter, cdf):
-        axes.grid(alpha=0.3)
-        axes.legend(fontsize=8, loc="best")
+    scatter.grid(alpha=0.3)
+    scatter.legend(fontsize=8, loc="best")
     figure.suptitle(title)
     return figure
+
+
+def error_map_figure(
+    scene: Scene,
+    place: Float[np.ndarray, "n 2"],
+    error_db: dict[str, Float[np.ndarray, "n"]],
+    title: str = "",
+) -> Figure:
+    """Errors at the places of readings [m], over the scene from above: a panel for each prediction.
+
+    error_db: predicted less measured, of every reading. Of several readings at a place the mean of the
+    errors is shown; red is predicted too strong, blue too weak, one scale for all panels.
+    """
+    where, of = np.unique(np.round(place, 3), axis=0, return_inverse=True)
+    count = np.bincount(of.ravel())
+    mean = {n: np.bincount(of.ravel(), e) / count for n, e in error_db.items()}
+    most = max((float(np.percentile(np.abs(m), 95)) for m in mean.values()), default=1.0) or 1.0
+    figure = Figure(figsize=(1.5 + 6.0 * max(1, len(mean)), 6.0), layout="constrained")
+    panels = figure.subplots(1, max(1, len(mean)), squeeze=False)[0]
+    look: dict[str, Any] = {"cmap": _ERROR, "norm": Normalize(-most, most)}
+    for axes, (name, values) in zip(panels, mean.items(), strict=False):
+        draw_top(axes, scene.with_receivers(()))
+        _radios(axes, scene, receivers=False)
+        axes.scatter(*where.T, c=values, s=18, linewidths=0.3, edgecolors=_EDGE, zorder=7, **look)
+        size = np.abs(error_db[name]).mean()
+        axes.set_title(f"{name}: mean of |error| {size:.1f} dB", fontsize=9)
+        _widen(axes, where)
+    bar = figure.colorbar(ScalarMappable(look["norm"], _ERROR), ax=panels, shrink=0.8)
+    bar.set_label("predicted less measured [dB]")
+    figure.suptitle(title)
+    return figure
+
+
+def cdf_figure(error_db: dict[str, Float[np.ndarray, "n"]], title: str = "") -> Figure:
+    """Distribution functions of absolute errors [dB], one line for each prediction."""
+    figure = Figure(figsize=(5.6, 4.6), layout="constrained")
+    _draw_cdf(figure.add_subplot(), error_db)
+    figure.suptitle(title)
+    return figure
+
+
+def _draw_cdf(axes: Axes, error_db: dict[str, Float[np.ndarray, "n"]]) -> None:
+    for i, (name, values) in enumerate(error_db.items()):
+        error = np.sort(np.abs(values))
+        share = np.arange(1, len(error) + 1) / max(1, len(error))
+        median, tail = np.percentile(error, (50, 90)) if len(error) else (np.nan, np.nan)
+        label = f"{name}: median {median:.1f} dB, 90 % {tail:.1f} dB"
+        axes.step(error, share, where="post", label=label, color=f"C{i}")
+    axes.set(xlabel="absolute error [dB]", ylabel="share of measurements", ylim=(0, 1))
+    axes.set_xlim(left=0)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, loc="lower right")
 
 
 def loss_figure(history: dict[str, list[float]], title: str = "") -> Figure:
@@ -402,6 +447,15 @@ def scene_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(3), np.ones(3)
     every = np.concatenate(points)
     return every.min(axis=0), every.max(axis=0)
+
+
+def _widen(axes: Axes, place: np.ndarray) -> None:
+    """Let limits take in places [m] that stand outside."""
+    margin = 0.02 * float(np.ptp(axes.get_xlim()))
+    for i, (ends, set_ends) in enumerate(
+        ((axes.get_xlim(), axes.set_xlim), (axes.get_ylim(), axes.set_ylim))
+    ):
+        set_ends(min(ends[0], place[:, i].min() - margin), max(ends[1], place[:, i].max() + margin))
 
 
 def _draw_space(axes: Any, scene: Scene) -> None:

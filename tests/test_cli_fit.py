@@ -12,7 +12,7 @@ from tests.learn.rooms import halfspace, readings, room_with, thing
 @pytest.fixture
 def files(tmp_path):
     """A scene with a thing of known material, and what it gives."""
-    scene = room_with(thing(halfspace(4.0, 0.1)), count=8)
+    scene = room_with(thing(halfspace(4.0, 0.1)), count=16)
     readings(scene, "rssi").to_csv(tmp_path / "readings.csv")
     return str(scene.to_usd(tmp_path / "room.usda")), str(tmp_path / "readings.csv"), tmp_path
 
@@ -24,26 +24,32 @@ def run(files, *options: str) -> int:
 
 
 def test_files_become_files(files, capsys):
-    select = ["--select", "/thing.surface", "--select", "power"]
-    assert run(files, *select, "--unknown", "/thing", "--validation", "0.25") == 0
+    select = ["--select", "/thing.surface", "--select", "power", "--unknown", "/thing"]
+    assert run(files, *select, "--residual") == 0
     said = capsys.readouterr().out
-    assert "/thing" in said and "validation, after" in said
+    assert "/thing" in said and "validation, after, with residual" in said and "covers" in said
     out = files[2] / "out"
     names = (
-        "scene.usda history.csv predictions.csv measurements.csv report.json loss.png errors.png"
+        "scene.usda history.csv predictions.csv measurements.csv report.json residual.safetensors "
+        "loss.png errors.png error_map.png cdf.png"
     )
     assert all((out / name).stat().st_size > 0 for name in names.split())
+    assert all(str(out / name) in said for name in names.split())
     assert json.loads((out / "report.json").read_text())["steps"] == 4
     assert Scene.from_usd(out / "scene.usda").node("/thing").body.surface.kind == "stochastic"
-    assert run(files, *select, "--unknown", "/thing") != 0
+    assert run(files, *select) != 0
     assert "already exists" in capsys.readouterr().err
-    again = [*select, "--unknown", "/thing", "--validation", "0.25", "--resume", "--steps", "6"]
-    assert run(files, *again) == 0
+    assert run(files, *select, "--resume", "--steps", "6") == 0
+    assert "with residual" not in capsys.readouterr().out
+    assert not (out / "residual.safetensors").exists()
 
 
 def test_what_cannot_be_learned_is_said(files, capsys):
     assert run(files, "--select", "/thin") == 3
     assert "near it: /thing" in capsys.readouterr().err
+    most = ["--validation", "0.5", "--residual"]
+    assert run(files, "--select", "power", *most) == 4
+    assert "8 training readings of power" in capsys.readouterr().err
     assert run(files, "--select", "/thing", "--unknown", "/nothing") == 3
     assert "names no object" in capsys.readouterr().err
     (files[2] / "readings.csv").write_text("tx,rx,rssi_dbm\n/tx,/rx0,loud\n")

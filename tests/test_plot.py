@@ -104,6 +104,7 @@ def test_figures_are_saved_as_pictures(small_run, tmp_path):
         "upright": plot.map_figure(steep, pair),
         "nothing": plot.map_figure(single, scene),
         "compared": plot.comparison_figure(measured, {"rfsg": measured + 1.0}),
+        "cdf": plot.cdf_figure({"rfsg": np.ones(3), "other": np.zeros(0)}),
     }
     for metric, shown in (("sinr", flat), ("best-server", flat), ("path-loss", surface)):
         figures[metric] = plot.map_figure(shown, pair, metric=metric)
@@ -113,6 +114,19 @@ def test_figures_are_saved_as_pictures(small_run, tmp_path):
     assert len(list(tmp_path.iterdir())) == len(figures)
     with pytest.raises(ValueError, match="best-server"):
         plot.map_figure(flat, pair, metric="colour")
+
+
+def test_an_error_map_shows_the_mean_at_each_place(small_run):
+    place = np.array([[1.0, 1.0], [2.0, 1.0], [1.0, 1.0], [9.0, -4.0]])
+    errors = {"physics": np.array([3.0, -1.0, 1.0, 0.5]), "with residual": np.zeros(4)}
+    figure = plot.error_map_figure(small_run.scene, place, errors)
+    first, second = figure.axes[:2]
+    shown = first.collections[0]
+    places = shown.get_offsets().tolist()
+    assert places == [[1.0, 1.0], [2.0, 1.0], [9.0, -4.0]]
+    assert shown.get_array().tolist() == [2.0, -1.0, 0.5]
+    assert "1.4 dB" in first.get_title() and "0.0 dB" in second.get_title()
+    assert first.get_xlim()[1] > 9.0 and first.get_ylim()[0] < -4.0
 
 
 def test_a_map_shows_the_best_in_each_cell_and_nothing_where_nothing_arrives():

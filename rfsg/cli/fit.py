@@ -74,6 +74,12 @@ def fit(
         bool, typer.Option("--incoherent", help="Add powers of paths, not their amplitudes.")
     ] = False,
     validation: Annotated[float, typer.Option(help="Share of readings never trained on.")] = 0.2,
+    residual: Annotated[
+        bool,
+        typer.Option(
+            help="Model what physics leaves of powers as well; reported beside physics alone.",
+        ),
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on from an interrupted run.")
     ] = False,
@@ -87,8 +93,8 @@ def fit(
 ) -> None:
     """Learn what is selected of a scene from measurements.
 
-    Writes the fitted scene and assets, history.csv, predictions.csv, report.json, a checkpoint and
-    pictures into --out.
+    Writes the fitted scene and assets, history.csv, predictions.csv with 90 % intervals, report.json,
+    a checkpoint and pictures into --out; with --residual also what physics leaves of the readings.
 
     Example: rfsg fit lab.usda readings.csv --select '/World/Cabinet.surface' --out fitted
     """
@@ -126,15 +132,19 @@ def fit(
             schedule=schedule.value,
             losses=losses,
             validation=validation,
+            residual=residual,
             resume=resume,
             overwrite=overwrite,
             progress=lambda done, total, word: progress("fitting", done, total, word),
         )
     pictures = _draw(fitted, out)
     print_table("errors", _errors(fitted.report))
+    if rows := _intervals(fitted.report):
+        print_table("intervals", rows)
     for cause, count in fitted.report["refused_steps"].items():
         note(f"{count} steps were refused: {cause} was not finite")
-    print_files(out, (*FILES, *pictures))
+    files = FILES if fitted.report["residual"] is None else (*FILES, "residual.safetensors")
+    print_files(out, (*files, *pictures))
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
@@ -148,23 +158,50 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _errors(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """Before, after, and with the residual: of training readings that is cross-validated."""
+
     def decibel(value: float | None) -> str:
         return "" if value is None else f"{value:.2f}"
 
+    names = {"before": "before", "after": "after", "with_residual": "after, with residual"}
     return [
         {
-            "readings": f"{which}, {when}",
+            "readings": f"{which}, {name}",
             "median [dB]": decibel(report[which][when]["median_db"]),
             "90 % within [dB]": decibel(report[which][when]["p90_db"]),
             "number": report[which][when]["readings"],
         }
         for which in ("train", "validation")
-        for when in ("before", "after")
+        for when, name in names.items()
+        if when in report[which]
+    ]
+
+
+def _intervals(report: dict[str, Any]) -> list[dict[str, Any]]:
+    """What is known of the 90 % intervals."""
+
+    def share(value: float | None) -> str:
+        return "not measured: no readings held" if value is None else f"{100 * value:.0f} %"
+
+    sure, left = report["uncertainty"], report["residual"]
+    if sure is None:
+        return []
+    named = {"physics": sure} | ({} if left is None else {"with residual": left})
+    return [
+        {
+            "90 % interval": name,
+            "median width [dB]": f"{said['median_width_db']:.2f}",
+            "covers": share(said["coverage"]),
+        }
+        for name, said in named.items()
     ]
 
 
 def _draw(fitted: "Fitted", out: Path) -> list[str]:
-    """loss.png; and errors.png where powers or gains were read."""
+    """loss.png; and where powers or gains were read errors.png, error_map.png and cdf.png.
+
+    Of the readings held for validation, where there are any.
+    """
     from rfsg import plot
     from rfsg.learn.losses import residual_db
     from rfsg.learn.measurements import Quantity
@@ -175,13 +212,34 @@ def _draw(fitted: "Fitted", out: Path) -> list[str]:
     use = use & (fitted.held if bool(fitted.held.any()) else ~fitted.held)
     if not bool(use.any()):
         return ["loss.png"]
-    # path gains, whatever was read: what was measured is what is predicted less the error
-    value = (after.path_gain_db() - residual_db(after, measured))[use]
-    predicted = {
-        name: (value + residual_db(said, measured)[use]).numpy()
-        for name, said in (("fitted", after), ("before", fitted.before))
-    }
     held = "readings not trained on" if bool(fitted.held.any()) else "readings trained on"
-    figure = plot.comparison_figure(value.numpy(), predicted, "dB path gain", held)
-    plot.save(figure, out / "errors.png")
-    return ["loss.png", "errors.png"]
+    off = {"physics": residual_db(after, measured)}
+    if fitted.spread is not None and fitted.spread.left is not None:
+        off["with residual"] = off["physics"] + fitted.spread.left
+    off["before"] = residual_db(fitted.before, measured)
+    errors = {name: value[use].numpy() for name, value in off.items()}
+    # path gains, whatever was read: what was measured is what is predicted less the error
+    value = after.path_gain_db()[use].numpy() - errors["physics"]
+    said = {name: value + error for name, error in errors.items()}
+    figures = {
+        "errors.png": plot.comparison_figure(value, said, "dB path gain", held),
+        "error_map.png": plot.error_map_figure(
+            fitted.scene,
+            _places(fitted)[use.numpy(), :2],
+            {name: error for name, error in errors.items() if name != "before"},
+            held,
+        ),
+        "cdf.png": plot.cdf_figure(errors, held),
+    }
+    for name, figure in figures.items():
+        plot.save(figure, out / name)
+    return ["loss.png", *figures]
+
+
+def _places(fitted: "Fitted") -> Any:
+    """Of every reading the end that stands at more places [m]: the other is a gateway."""
+    from rfsg.learn.links import link_up
+    from rfsg.learn.over_scene import Ends
+
+    ends = Ends.of(link_up(fitted.scene, fitted.measured))
+    return ends.rx if ends.receivers_are_places() else ends.tx

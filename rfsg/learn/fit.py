@@ -12,17 +12,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
+from rfsg.learn.calibration import Spread, refuse_early, spread_of
 from rfsg.learn.errors import LearnError
 from rfsg.learn.links import link_up
-from rfsg.learn.losses import Losses, Predicted, residual_db
-from rfsg.learn.measurements import Measurements, Quantity
+from rfsg.learn.losses import Losses, Predicted
+from rfsg.learn.measurements import Measurements
+from rfsg.learn.model import Model, Predictive
 from rfsg.learn.output import CHECKPOINT, prepare, write
-from rfsg.learn.predict import predict
+from rfsg.learn.over_scene import ResidualSettings
 from rfsg.learn.regularisation import Regularisation
+from rfsg.learn.reporting import report_of
 from rfsg.learn.selection import Selection
 from rfsg.learn.selection import select as choose
 from rfsg.learn.training import COLUMNS, Settings, Training
@@ -41,7 +43,8 @@ class Fitted:
     scene: with what was learned; transmit powers hold the power offset. history: one entry per step,
     by column. report: errors before and after, counts, settings; what ``report.json`` holds.
     gains_db: offsets of radios, which no scene holds. measured, before, after: the readings, and what
-    was and is predicted of them; held: which of them were kept for validation.
+    was and is predicted of them; held: which of them were kept for validation. spread: how far readings
+    of power lie from that, and what is left where a residual was asked for; None without powers.
     """
 
     scene: Scene
@@ -54,17 +57,29 @@ class Fitted:
     held: Tensor
     before: Predicted
     after: Predicted
+    spread: Spread | None = None
 
-    def predict(self, measured: Measurements, scene: Scene | None = None) -> Predicted:
-        """What the fitted scene, or one made from it, says of readings; their values are not read."""
-        return predict(
-            self.scene if scene is None else scene,
-            measured,
+    @property
+    def model(self) -> Model:
+        """What predicts, apart from how it was fitted; ``rfsg.learn.model.load`` reads it from OUT."""
+        spread = self.spread
+        return Model(
+            self.scene,
             self.quality,
-            coherent=self.losses.coherent,
-            gains_db=self.gains_db,
-            offset_db=self.report["offsets"]["power_db"] or 0.0,
+            self.losses.coherent,
+            self.gains_db,
+            self.report["offsets"]["power_db"] or 0.0,
+            None if spread is None else spread.uncertainty,
+            None if spread is None else spread.residual,
+            0.0 if spread is None else spread.left_widened_db,
         )
+
+    def predict(self, measured: Measurements, scene: Scene | None = None) -> Predictive:
+        """What the fitted scene, or one made from it, says of readings; their values are not read.
+
+        With 90 % intervals, and with the residual where there is one: see ``Predictive``.
+        """
+        return self.model.predict(measured, scene)
 
 
 def fit(
@@ -85,6 +100,7 @@ def fit(
     regularisation: Regularisation | None = None,
     validation: float = 0.2,
     exact: bool = False,
+    residual: bool | ResidualSettings = False,
     checkpoint_every: int = CHECKPOINT_EVERY,
     resume: bool = False,
     overwrite: bool = False,
@@ -96,9 +112,11 @@ def fit(
     and rate are the paper's (section 5.1). schedule: "constant", or "cosine" for a rate that falls to
     1 %. rates: by pattern, how much larger a step is than that of a weight. refresh: steps between
     searches, where anything moves. validation: share of the readings that is never trained on.
-    exact: learned fields in float64 too. out: folder for everything; a checkpoint is written there
-    every ``checkpoint_every`` steps, and with ``resume`` a run that was killed ends in the same bits
-    as one that was not. ``overwrite`` begins anew in a folder that holds a fit.
+    exact: learned fields in float64 too. residual: model what physics leaves of powers as well
+    (``rfsg.learn.over_scene``), reported beside physics, never instead of it. out: folder for
+    everything; a checkpoint is written there every ``checkpoint_every`` steps, and with ``resume`` a
+    run that was killed ends in the same bits as one that was not. ``overwrite`` begins anew in a
+    folder that holds a fit.
 
     Raises MeasurementError for readings that cannot be used, LearnError for a fit that cannot begin
     or go on (with the likely causes), SceneError where ``out`` is taken.
@@ -118,6 +136,7 @@ def fit(
         regularisation=regularisation or Regularisation(),
         exact=exact,
     )
+    over = ResidualSettings.of(residual)
     links = link_up(scene, measurements)
     radios = [r.path for r in (*links.transmitters, *links.receivers)]
     selection = choose(scene, select, radios=radios, frequency=float(links.frequency[0]))
@@ -127,13 +146,15 @@ def fit(
     training = Training(scene, selection, measurements, links, held, settings, tell)
     training.search()
     before = training.predicted_all()
+    if over is not None:
+        refuse_early(training, before)
     checkpoint = None if folder is None else folder / CHECKPOINT
     if checkpoint is not None and resume and checkpoint.exists():
         training.load(checkpoint)
     _run(training, checkpoint, checkpoint_every, progress)
     if training.moving:
         training.search()
-    fitted = _fitted(scene, training, before)
+    fitted = _fitted(scene, training, before, over)
     if folder is not None:
         write(folder, fitted, selection)
     return fitted
@@ -166,7 +187,9 @@ def _held(measured: Measurements, share: float, seed: int) -> Tensor:
 # the result
 
 
-def _fitted(scene: Scene, training: Training, before: Predicted) -> Fitted:
+def _fitted(
+    scene: Scene, training: Training, before: Predicted, over: ResidualSettings | None
+) -> Fitted:
     selection, settings = training.selection, training.settings
     after = training.predicted_all()
     gains = {path: float(p.detach()) for path, p in selection.gains.items()}
@@ -182,8 +205,9 @@ def _fitted(scene: Scene, training: Training, before: Predicted) -> Fitted:
         training.held,
         before,
         after,
+        spread_of(training, after, over),
     )
-    return replace(fitted, report=_report(training, fitted))
+    return replace(fitted, report=report_of(training, fitted))
 
 
 @torch.no_grad()
@@ -213,76 +237,3 @@ def _restore(body: nn.Module, like: nn.Module) -> None:
     wanted = {name: p.requires_grad for name, p in like.named_parameters()}
     for name, p in body.named_parameters():
         p.requires_grad_(wanted.get(name, False))
-
-
-def _report(training: Training, fitted: Fitted) -> dict[str, Any]:
-    """What a person asks about a fit, ready for JSON."""
-    measured, held = fitted.measured, training.held
-    kept = training.kept
-    assert kept is not None
-    speaking, power = training.speaking(kept), training.selection.power
-    seconds = np.array(training.seconds or [0.0])
-    errors = {
-        name: {
-            when: _errors(predicted, measured, where)
-            for when, predicted in (("before", fitted.before), ("after", fitted.after))
-        }
-        for name, where in (("train", ~held), ("validation", held))
-    }
-    return {
-        **errors,
-        "selected": training.selection.rows(),
-        "offsets": {
-            "gains_db": fitted.gains_db,
-            "power_db": None if power is None else float(power.detach()),
-        },
-        "readings": {
-            "all": len(measured),
-            "train": int((~held).sum()),
-            "say_something": int((speaking & ~held).sum()),
-            "not_received": int((~measured.received).sum()),
-            "received_without_a_path": int((measured.received & ~fitted.after.arrives).sum()),
-        },
-        "frequency_hz": training.links.frequency.tolist(),
-        "paths": {
-            "all": len(kept.link),
-            "meet_what_is_learned": int(kept.live.sum()),
-            "solved_again_each_step": int(kept.traced.sum()),
-            "held_between_searches": kept.held(),
-        },
-        "statuses": dict(sorted(kept.counts.items())),
-        "searches": training.searches,
-        "steps": training.done,
-        "refused_steps": dict(training.refused),
-        "seconds_per_step": {
-            "median": float(np.median(seconds)),
-            "p90": float(np.percentile(seconds, 90)),
-        },
-        "settings": training.settings.told(),
-        "source": measured.source,
-    }
-
-
-def _errors(predicted: Predicted, measured: Measurements, where: Tensor) -> dict[str, Any]:
-    """Median and 90th percentile of |error| [dB] of received powers and gains; delays apart.
-
-    not_received_but_predicted: readings below their threshold that are predicted above it.
-    """
-    power = measured.quantity != int(Quantity.DELAY)
-    use = where & measured.received & predicted.arrives
-    off = residual_db(predicted, measured)[use & power].abs().numpy()
-    late = (predicted.delay - measured.value[:, 0])[use & ~power].abs().numpy()
-    silent = where & ~measured.received
-    loud = silent & predicted.arrives & (predicted.rssi_dbm() > measured.threshold)
-    return {
-        "readings": len(off),
-        "median_db": _quantile(off, 50),
-        "p90_db": _quantile(off, 90),
-        "median_delay_s": _quantile(late, 50),
-        "not_received": int(silent.sum()),
-        "not_received_but_predicted": int(loud.sum()),
-    }
-
-
-def _quantile(values: np.ndarray, percent: float) -> float | None:
-    return float(np.percentile(values, percent)) if len(values) else None

@@ -38,14 +38,21 @@ from rfsg.tracer.records import Act, Channel, Paths
 from rfsg.tracer.simulate import positions, simulate, world_for
 
 DEEPER_DB = 40.0  # below the floor: what a learned object hides today may matter when it is learned
+DARKEST = (
+    1e-30  # share of the power below which a coefficient counts as this, where its log is asked
+)
 AT_ONCE = 16_384  # paths evaluated together where no gradient is asked for
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class Shares:
-    """What paths carry: of which of the links asked for, their share of h(f), delay [s], directions."""
+    """What paths carry: of which of the links asked for, their share of h(f), delay [s], directions.
 
+    path: their numbers among all that are kept.
+    """
+
+    path: Int[Tensor, "p"]
     link: Int[Tensor, "p"]
     value: Complex[Tensor, "p f"]
     delay: Float[Tensor, "p"]
@@ -217,16 +224,28 @@ class Kept:
         world = _posed(self.world, scene)
         still = ~self.live[rows]
         parts: list[tuple[Tensor, ...]] = []
-        parts.append((link[still], self.value[rows[still]], *self._way(rows[still])))
+        i = rows[still]
+        parts.append((i, link[still], self.value[i], *self._way(i)))
         traced = self.traced[rows]
         factored = ~still & ~traced
         if bool(factored.any()):
-            value = self.factors.shares(self.number[rows[factored]], world)
-            parts.append((link[factored], value, *self._way(rows[factored])))
+            i = rows[factored]
+            value = self.factors.shares(self.number[i], world)
+            parts.append((i, link[factored], value, *self._way(i)))
         if bool(traced.any()):
-            found = self._traced(rows[traced], world)
-            parts.append((link[traced], *(_field(name, found) for name in _FIELDS)))
+            i = rows[traced]
+            found = self._traced(i, world)
+            parts.append((i, link[traced], *(_field(name, found) for name in _FIELDS)))
         return Shares(*(torch.cat(column) for column in zip(*parts, strict=True)))
+
+    @torch.no_grad()
+    def values(self, scene: Scene) -> Complex[Tensor, "p f"]:
+        """The share of h(f) of every path, with the parameters as they are now."""
+        total = torch.zeros_like(self.value)
+        for asked in torch.arange(len(self.links)).split(AT_ONCE):
+            shares = self.shares(asked, scene)
+            total[shares.path] = shares.value
+        return total
 
     def _way(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         return self.delay[rows], self.departure[rows], self.arrival[rows]

@@ -5,6 +5,7 @@ assets/NAME.usda    every fitted object, with what it was trained on
 history.csv         one line per step
 predictions.csv     measured and predicted, reading by reading
 measurements.csv    the readings that were used
+residual.safetensors  what the scene leaves of powers, where that was asked for
 report.json         errors before and after, counts, settings; written last
 checkpoint.safetensors
 """
@@ -22,6 +23,7 @@ import torch
 
 from rfsg.learn.losses import residual_db
 from rfsg.learn.measurements import Quantity
+from rfsg.learn.model import REPORT, RESIDUAL, SCENE
 from rfsg.learn.selection import Selection
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.proxy import extract_mesh
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
     from rfsg.learn.fit import Fitted
 
 CHECKPOINT = "checkpoint.safetensors"
-FILES = ("scene.usda", "history.csv", "predictions.csv", "measurements.csv", "report.json")
+FILES = (SCENE, "history.csv", "predictions.csv", "measurements.csv", RESIDUAL, REPORT)
 SHOWN_TOLERANCE = 0.002  # [m] by which the mesh that is only shown may differ from the zero mesh
 
 
@@ -49,11 +51,15 @@ def prepare(folder: Path, resume: bool, overwrite: bool) -> Path:
 def write(folder: Path, fitted: "Fitted", selection: Selection) -> None:
     """Write all but the checkpoint; each file whole or not at all."""
     scene = save_assets(folder / "assets", fitted, selection)
-    scene.to_usd(folder / "scene.usda", overwrite=True)
+    scene.to_usd(folder / SCENE, overwrite=True)
     write_beside(folder / "history.csv", _history(fitted.history), True)
     write_beside(folder / "predictions.csv", _predictions(fitted), True)
     write_beside(folder / "measurements.csv", fitted.measured.csv(), True)
-    write_beside(folder / "report.json", to_json(fitted.report), True)
+    if fitted.spread is not None and fitted.spread.residual is not None:
+        write_beside(folder / RESIDUAL, fitted.spread.residual.pack(), True)
+    else:
+        (folder / RESIDUAL).unlink(missing_ok=True)  # of a fit that is overwritten
+    write_beside(folder / REPORT, to_json(fitted.report), True)
 
 
 def save_assets(folder: Path, fitted: "Fitted", selection: Selection) -> Scene:
@@ -112,25 +118,31 @@ def _history(history: dict[str, list[float]]) -> bytes:
     return _csv(["step", *columns], ([k + 1, *row] for k, row in enumerate(rows)))
 
 
+COLUMNS = (
+    "tx rx frequency_hz quantity measured predicted low high with_residual with_residual_low "
+    "with_residual_high error_db used"
+).split()
+
+
 def _predictions(fitted: "Fitted") -> bytes:
     """One line per reading, in the units of its kind: dBm, dB, or seconds."""
     measured, after = fitted.measured, fitted.after
-    rssi, gain_db, off = (
-        t.tolist() for t in (after.rssi_dbm(), after.path_gain_db(), residual_db(after, measured))
-    )
+    value = {
+        Quantity.RSSI: after.rssi_dbm().tolist(),
+        Quantity.PATH_GAIN: after.path_gain_db().tolist(),
+        Quantity.DELAY: after.delay.tolist(),
+    }
+    value[Quantity.GAIN] = value[Quantity.PATH_GAIN]
+    off = residual_db(after, measured).tolist()
+    beside = _beside(fitted)
     rows = []
     for i, kind in enumerate(measured.quantity.tolist()):
         quantity = Quantity(kind)
         arrives, received = bool(after.arrives[i]), bool(measured.received[i])
-        value: Any = {
-            Quantity.RSSI: rssi[i],
-            Quantity.PATH_GAIN: gain_db[i],
-            Quantity.GAIN: gain_db[i],
-            Quantity.DELAY: float(after.delay[i]),
-        }[quantity]
-        shown = float(measured.value[i, 0])
+        shown, said = float(measured.value[i, 0]), value[quantity][i]
         if quantity == Quantity.GAIN:
             shown = 20.0 * math.log10(float(torch.linalg.vector_norm(measured.value[i])))
+        around = beside[i] if beside else [None] * 5
         rows.append(
             [
                 _name(measured.tx_places[int(measured.tx[i])]),
@@ -138,13 +150,29 @@ def _predictions(fitted: "Fitted") -> bytes:
                 float(measured.frequency[i]),
                 quantity.name.lower(),
                 shown if received else "",
-                value if arrives else "",
+                said if arrives else "",
+                *("" if x is None else said + x for x in around),
                 off[i] if arrives and received and quantity != Quantity.DELAY else "",
                 "validation" if bool(fitted.held[i]) else "train",
             ]
         )
-    names = "tx rx frequency_hz quantity measured predicted error_db used".split()
-    return _csv(names, rows)
+    return _csv(COLUMNS, rows)
+
+
+def _beside(fitted: "Fitted") -> list[list[float | None]]:
+    """Bounds, and what stands in the columns with the residual, about each prediction [dB]."""
+    spread = fitted.spread
+    if spread is None:
+        return []
+    columns = [*spread.interval]
+    if spread.left is not None and spread.left_interval is not None:
+        columns += [spread.left, *spread.left_interval]
+    rows = torch.stack(columns, -1).tolist()
+    none: list[float | None] = [None] * 5
+    return [
+        [*row, *none][:5] if there else none
+        for row, there in zip(rows, spread.of.tolist(), strict=True)
+    ]
 
 
 def _name(place: Any) -> str:

@@ -30,12 +30,24 @@ def predict(
     gains_db: of radios by path, as a fit found them. offset_db: of the powers of what sends and is
     no transmitter of the scene, whose own powers a fit has already put right.
     """
+    kept = search(scene, measured, quality)
+    return predict_kept(kept, scene, coherent, gains_db or {}, offset_db)
+
+
+def search(scene: Scene, measured: Measurements, quality: str | Quality = "draft") -> Kept:
+    """The paths of every reading's link; nothing of them is learned."""
     quality = Quality.named(quality) if isinstance(quality, str) else quality
-    links = link_up(scene, measured)
-    kept = Kept(scene, links, quality, [], [])
-    gains = {k: torch.tensor(v, dtype=torch.float64) for k, v in (gains_db or {}).items()}
+    return Kept(scene, link_up(scene, measured), quality, [], [])
+
+
+def predict_kept(
+    kept: Kept, scene: Scene, coherent: bool, gains_db: Mapping[str, float], offset_db: float
+) -> Predicted:
+    """As ``predict``, over paths that were found already."""
+    gains = {k: torch.tensor(v, dtype=torch.float64) for k, v in gains_db.items()}
     own = {id(r) for r in scene.transmitters}
-    offset = torch.tensor([0.0 if id(r) in own else offset_db for r in links.transmitters])
+    radios = kept.links.transmitters
+    offset = torch.tensor([0.0 if id(r) in own else offset_db for r in radios])
     return predict_all(kept, scene, coherent, gains, offset)
 
 
