@@ -1,10 +1,14 @@
 """``rfsg fit`` from files to files, and what it says when it cannot."""
 
 import json
+import math
 
 import pytest
+import torch
 
 from rfsg import cli
+from rfsg.learn.measurements import Measurements
+from rfsg.learn.model import load
 from rfsg.scene.scene import Scene
 from tests.learn.rooms import halfspace, readings, room_with, thing
 
@@ -55,3 +59,32 @@ def test_what_cannot_be_learned_is_said(files, capsys):
     (files[2] / "readings.csv").write_text("tx,rx,rssi_dbm\n/tx,/rx0,loud\n")
     assert run(files, "--select", "/thing") == 3
     assert "readings.csv:2: rssi_dbm: expected a finite number" in capsys.readouterr().err
+
+
+def test_regions_need_no_scene(tmp_path, capsys):
+    """From a file of places to a scene that predicts, level and all; resumed it stays what it was."""
+    random = torch.Generator().manual_seed(0)
+    lines = ["tx_x_m,tx_y_m,tx_z_m,rx_x_m,rx_y_m,rx_z_m,frequency_hz,rssi_dbm"]
+    for x, y in (8.0 * torch.rand(30, 2, generator=random)).tolist():
+        apart = math.dist((x, y, 1.0), (0.0, 0.0, 2.0))
+        lines.append(f"{x},{y},1,0,0,2,2.44e9,{-20 - 20 * math.log10(apart) - 40.2}")
+    csv, out = tmp_path / "readings.csv", tmp_path / "out"
+    csv.write_text("\n".join(lines) + "\n")
+    asked = ["fit-regions", str(csv), "--out", str(out), "--cell", "9", "--steps", "3"]
+    assert cli.run([*asked, "--residual"]) == 0
+    said = capsys.readouterr().out
+    assert "with residual" in said and "covers" in said
+    report = json.loads((out / "report.json").read_text())
+    assert report["offsets"]["power_db"] == pytest.approx(-20.0, abs=0.5)
+    model = load(out)
+    told = model.predict(Measurements.from_csv(csv)).rssi_dbm()
+    measured = Measurements.from_csv(csv).value[:, 0]
+    assert (told - measured).abs().max() < 1.0  # an offset of the receiver that is not the scene's
+    assert cli.run(asked) != 0
+    assert "already exists" in capsys.readouterr().err
+    assert cli.run([*asked, "--residual", "--resume"]) == 0
+    again = json.loads((out / "report.json").read_text())
+    assert again["validation"] == report["validation"] and again["offsets"] == report["offsets"]
+    csv.write_text("tx,rx,frequency_hz,rssi_dbm\n/a,/b,2.44e9,-50\n")
+    assert cli.run([*asked, "--overwrite"]) == 4
+    assert "'/a' is given by name" in capsys.readouterr().err

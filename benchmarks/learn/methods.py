@@ -15,7 +15,8 @@ from rfsg.learn import baselines
 from rfsg.learn.baselines import Method
 from rfsg.learn.free_space import FreeSpace
 from rfsg.learn.losses import Losses
-from rfsg.learn.regions import Budget, RegionPhysics
+from rfsg.learn.region_physics import RegionPhysics
+from rfsg.learn.regions import Budget
 from rfsg.learn.required import Required
 from rfsg.learn.residual import Residual
 
@@ -130,7 +131,7 @@ def regions() -> Entry:
         f"{how.steps} steps of {how.batch} readings, regions of {rich.cell_m:g} m at most, rate "
         f"{how.learning_rate:g}"
     )
-    ours = ("required", "free_space", "regions", "training", "losses")
+    ours = ("required", "free_space", "regions", "region_physics", "training", "losses")
     return Entry(
         lambda case: method,
         version(*(f"../{name}" for name in ours), budget=repr(method)),

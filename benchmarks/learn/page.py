@@ -35,11 +35,21 @@ def tables(results: Sequence[Result], methods: dict[str, Entry]) -> str:
             "each row in bold.\n",
             grid(mine, names, errors),
         ]
+        rivals = [n for n in names if methods[n].baseline]
+        ours = [n for n in names if n.endswith("residual")]
+        if rivals and ours:
+            parts += [
+                f"\n### {data_set}: against the best baseline\n",
+                "The least median and the least 90th percentile of any baseline, and ours over it.\n",
+                against(mine, rivals, ours),
+            ]
         if unsure:
             parts += [
                 f"\n### {data_set}: coverage of the 90 % interval\n",
                 "Share of test readings inside, for the methods that give an interval.\n",
                 grid(mine, unsure, covers),
+                "",
+                overall(mine, unsure),
             ]
         parts += [
             f"\n### {data_set}: seconds per fit\n",
@@ -48,6 +58,50 @@ def tables(results: Sequence[Result], methods: dict[str, Entry]) -> str:
             "",
         ]
     return "\n".join(parts)
+
+
+def against(results: Sequence[Result], rivals: Sequence[str], ours: Sequence[str]) -> str:
+    """A row per crop, split and density, of methods that ran for all seeds."""
+    titles = [f"{name}: {what}" for name in ours for what in ("median", "90th percentile")]
+    lines = ["| crop | split | readings/sq ft | best median | best 90th percentile | "]
+    lines[0] += " | ".join(titles) + " |"
+    lines.append("|---" * (5 + len(titles)) + "|")
+    cells = by_row(results)
+    for key in dict.fromkeys(k for k, _ in cells):
+        seeds = max(len(column) for (k, _), column in cells.items() if k == key)
+        found = {n: pooled(cells[key, n]) for n in (*rivals, *ours) if len(cells[key, n]) == seeds}
+        told = {n: pair for n, pair in found.items() if pair is not None}
+        best = [min(((told[n][i], n) for n in rivals if n in told), default=None) for i in (0, 1)]
+        said = [MISSING if b is None else f"{b[0]:.2f} ({b[1]})" for b in best]
+        for name in ours:
+            for i, b in enumerate(best):
+                known = b is not None and name in told
+                said.append(f"{told[name][i] / b[0]:.2f}" if b is not None and known else MISSING)
+        lines.append(f"| {key[0]} | {key[1]} | {key[2]:g} | " + " | ".join(said) + " |")
+    return "\n".join(lines)
+
+
+def overall(results: Sequence[Result], names: Sequence[str]) -> str:
+    """Coverage of each crop, all its splits, densities and seeds together."""
+    lines = ["| crop | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for crop in dict.fromkeys(r.case.crop for r in results):
+        columns = [
+            [r.outcome for r in results if r.case.crop == crop and r.method == name]
+            for name in names
+        ]
+        lines.append(f"| {crop} | " + " | ".join(covers(columns)) + " |")
+    return "\n".join(lines)
+
+
+Row = tuple[str, str, float]
+
+
+def by_row(results: Sequence[Result]) -> dict[tuple[Row, str], list[Outcome]]:
+    """The outcomes of all seeds, by crop, split and density, and by method."""
+    cells = defaultdict(list)
+    for r in results:
+        cells[(r.case.crop, r.case.split, r.case.density), r.method].append(r.outcome)
+    return cells
 
 
 def has_std(result: Result) -> bool:
@@ -61,12 +115,8 @@ def grid(
     row: Callable[[Sequence[Sequence[Outcome]]], list[str]],
 ) -> str:
     """A table with a row per crop, split and density; ``row`` writes its cells."""
-    cells = defaultdict(list)
-    keys = {}
-    for r in results:
-        key = (r.case.crop, r.case.split, r.case.density)
-        keys[key] = None
-        cells[key, r.method].append(r.outcome)
+    cells = by_row(results)
+    keys = dict.fromkeys(key for key, _ in cells)
     lines = ["| crop | split | readings/sq ft | seeds | " + " | ".join(names) + " |"]
     lines.append("|---" * (len(names) + 4) + "|")
     for key in keys:

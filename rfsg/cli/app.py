@@ -11,6 +11,7 @@ from rfsg import __version__
 from rfsg.cli.assets import check, info, learn_shape
 from rfsg.cli.errors import INTERRUPTED, verdict
 from rfsg.cli.fit import fit
+from rfsg.cli.fit_regions import fit_regions
 from rfsg.cli.map import map_
 from rfsg.cli.simulate import simulate
 from rfsg.cli.terminal import say
@@ -22,6 +23,7 @@ COMMANDS: dict[str, Callable[..., None]] = {  # in the order of --help
     "info": info,
     "learn-shape": learn_shape,
     "fit": fit,
+    "fit-regions": fit_regions,
 }
 
 app = typer.Typer(

@@ -137,6 +137,11 @@ def fit(
             overwrite=overwrite,
             progress=lambda done, total, word: progress("fitting", done, total, word),
         )
+    finish(fitted, out)
+
+
+def finish(fitted: "Fitted", out: Path) -> None:
+    """Pictures, and what a person wants to know of a fit that was written to ``out``."""
     pictures = _draw(fitted, out)
     print_table("errors", _errors(fitted.report))
     if rows := _intervals(fitted.report):

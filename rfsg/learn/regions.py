@@ -11,18 +11,21 @@ imaging (Wilson and Patwari, IEEE Trans. Mobile Computing 9(5), 2010), in object
 
 import math
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy import ndarray
 from torch import Tensor
 
-from rfsg.learn.baselines.readings import LEAST_DISTANCE, Prediction, Readings, check_links
+from rfsg.learn.baselines.readings import LEAST_DISTANCE
 from rfsg.learn.errors import LearnError
-from rfsg.learn.fit import Fitted, fit
-from rfsg.learn.losses import Losses, residual_db
+from rfsg.learn.fit import Fitted, Progress, fit
+from rfsg.learn.losses import Losses
 from rfsg.learn.measurements import Measurements, Place, Quantity
+from rfsg.learn.model import REPORT
+from rfsg.learn.output import to_json
+from rfsg.learn.over_scene import ResidualSettings
 from rfsg.learn.regularisation import Regularisation
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.analytic import Box
@@ -30,6 +33,7 @@ from rfsg.objects.surfaces.stochastic import StochasticSurface
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Node, Scene
+from rfsg.scene.weights import write_beside
 from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.plan import Quality
 
@@ -204,12 +208,19 @@ def fit_regions(
     height_m: float | None = None,
     budget: Budget | None = None,
     seed: int = 0,
+    validation: float = 0.2,
+    residual: bool | ResidualSettings = False,
+    out: str | Path | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
 ) -> Fitted:
     """Learn what stands between radios at known positions, where no scene is given.
 
-    measurements: between positions; powers and gains (delays of direct paths say nothing). The rest
-    as in ``region_scene``. The level of the readings is found first, in closed form: readings 20 dB
-    below free space would else fill every region before the offset has moved.
+    measurements: between positions; powers and gains (delays of direct paths say nothing). The sizes
+    as in ``region_scene``; from ``validation`` on as in ``rfsg.fit``. The level of the readings is found
+    first, in closed form: readings 20 dB below free space would else fill every region before the
+    offset has moved.
 
     Of what comes back, ``scene`` can be looked at, simulated and written as any other; ``predict`` takes
     readings at other positions, and ``/World/Receivers/r0`` for a receiver whose offset is to count.
@@ -224,7 +235,21 @@ def fit_regions(
         tx_places=tuple(r.path for r in scene.transmitters),
         rx_places=tuple(r.path for r in scene.receivers),
     )
-    return _learned(scene, named, budget or Budget(), seed)
+    fitted = learned(
+        scene,
+        named,
+        budget or Budget(),
+        seed,
+        validation=validation,
+        residual=residual,
+        out=out,
+        resume=resume,
+        overwrite=overwrite,
+        progress=progress,
+    )
+    if out is not None:  # with the whole level, which the fit itself does not know
+        write_beside(Path(out) / REPORT, to_json(fitted.report), True)
+    return fitted
 
 
 def _positions(places: tuple[Place, ...]) -> Float[Tensor, "n 3"]:
@@ -237,8 +262,19 @@ def _positions(places: tuple[Place, ...]) -> Float[Tensor, "n 3"]:
     return torch.tensor(places, dtype=torch.float64).reshape(-1, 3)
 
 
-def _learned(scene: Scene, measured: Measurements, budget: Budget, seed: int) -> Fitted:
-    """Fit the regions of a scene to readings of its radios, which these name by path."""
+def learned(
+    scene: Scene,
+    measured: Measurements,
+    budget: Budget,
+    seed: int,
+    *,
+    validation: float = 0.0,
+    **writing: Any,
+) -> Fitted:
+    """Fit the regions of a scene to readings of its radios, which these name by path.
+
+    ``writing`` goes to ``rfsg.fit`` as it is.
+    """
     select = [f"{REGIONS}/*.surface.bulk"]
     level = _level_dbm(scene, measured)
     if level is not None:
@@ -261,7 +297,8 @@ def _learned(scene: Scene, measured: Measurements, budget: Budget, seed: int) ->
         losses=budget.losses,
         # The features under kappa are smooth already, and Eq. 25 in every region doubles the time.
         regularisation=Regularisation(laplacian=0.0, eikonal=0.0),
-        validation=0.0,
+        validation=validation,
+        **writing,
     )
     if level is None:
         return fitted
@@ -292,94 +329,3 @@ def _level_dbm(scene: Scene, measured: Measurements) -> float | None:
 def friis_db(distance: Float[Tensor, "n"], frequency: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     """Free-space path gain 20 log10(c / (4 pi d f)) [dB] between isotropic antennas (ITU-R P.525)."""
     return 20.0 * torch.log10(SPEED_OF_LIGHT / (4.0 * math.pi * distance * frequency))
-
-
-# as a method among others
-
-
-@dataclass(frozen=True)
-class RegionPhysics:
-    """Regions learned from received readings: a ``Method`` (``rfsg.learn.baselines``).
-
-    Sizes as in ``region_scene`` [m]; frequency_hz of all readings.
-    """
-
-    cell_m: float = 3.0
-    margin_m: float = 0.5
-    height_m: float | None = None
-    frequency_hz: float = 2.44e9
-    budget: Budget = field(default_factory=Budget)
-
-    def fit(self, readings: Readings, seed: int = 0) -> "RegionPredictor":
-        """Raises LearnError as ``region_scene`` and ``rfsg.fit`` do."""
-        tx = _apart(readings.tx_position, readings.rx_position)
-        tx, tx_of = np.unique(tx, axis=0, return_inverse=True)
-        receiver = np.column_stack([readings.gateway, readings.rx_position])
-        receiver, rx_of = np.unique(receiver, axis=0, return_inverse=True)
-        links = torch.from_numpy(np.unique(np.column_stack([tx_of.ravel(), rx_of.ravel()]), axis=0))
-        scene = region_scene(
-            torch.from_numpy(tx),
-            torch.from_numpy(receiver[:, 1:].copy()),
-            links=links,
-            cell_m=self.cell_m,
-            margin_m=self.margin_m,
-            height_m=self.height_m,
-            seed=seed,
-        )
-        measured = Measurements.of(
-            tx=[scene.transmitters[i].path for i in tx_of.ravel()],
-            rx=[scene.receivers[i].path for i in rx_of.ravel()],
-            rssi_dbm=readings.rssi.tolist(),
-            frequency_hz=self.frequency_hz,
-        )
-        fitted = _learned(scene, measured, self.budget, seed)
-        gains = [fitted.gains_db.get(r.path, 0.0) for r in scene.receivers]
-        heard, at = np.unique(receiver[:, 0].astype(np.int64), return_inverse=True)
-        offset = np.bincount(at, np.array(gains)) / np.bincount(at)
-        rest = residual_db(fitted.after, fitted.measured)
-        std = float(rest.square().mean().sqrt())
-        return RegionPredictor(fitted, heard, offset, std, self.frequency_hz)
-
-
-@dataclass(frozen=True)
-class RegionPredictor:
-    """Fitted regions, ``offset`` [dB] of each of ``gateways``, ``std`` [dB] of the fit's residuals.
-
-    A gateway that was not heard has the mean offset of those that were. ``std`` is of the training
-    readings and says nothing of regions that they never crossed: a lower bound elsewhere.
-    """
-
-    fitted: Fitted
-    gateways: Int[ndarray, "g"]
-    offset: Float[ndarray, "g"]
-    std: float
-    frequency_hz: float
-
-    def predict(
-        self,
-        tx_position: Float[ndarray, "n 3"],
-        rx_position: Float[ndarray, "n 3"],
-        gateway: Int[ndarray, "n"],
-    ) -> Prediction:
-        """Mean [dBm] and standard deviation [dB] of links between positions in metres.
-
-        Raises ValueError when lengths differ or a position is not finite.
-        """
-        check_links(tx_position, rx_position, gateway)
-        tx = _apart(tx_position, rx_position)
-        columns = {f"tx_{a}_m": tx[:, i].tolist() for i, a in enumerate("xyz")}
-        columns |= {f"rx_{a}_m": rx_position[:, i].tolist() for i, a in enumerate("xyz")}
-        asked = Measurements.of(**columns, rssi_dbm=[0.0] * len(tx), frequency_hz=self.frequency_hz)
-        mean = self.fitted.predict(asked).rssi_dbm().numpy()
-        at = np.minimum(np.searchsorted(self.gateways, gateway), len(self.gateways) - 1)
-        known = self.gateways[at] == gateway
-        mean = mean + np.where(known, self.offset[at], self.offset.mean())
-        return Prediction(mean, np.full(len(mean), self.std))
-
-
-def _apart(
-    tx_position: Float[ndarray, "n 3"], rx_position: Float[ndarray, "n 3"]
-) -> Float[ndarray, "n 3"]:
-    """Transmitters, those nearer than LEAST_DISTANCE to their receiver put that far above it."""
-    near = np.linalg.norm(tx_position - rx_position, axis=-1, keepdims=True) < LEAST_DISTANCE
-    return np.where(near, rx_position + [0.0, 0.0, LEAST_DISTANCE], tx_position)

@@ -10,12 +10,12 @@ import torch
 import rfsg
 from rfsg.learn.baselines import Method, Predictor, Readings
 from rfsg.learn.errors import LearnError
+from rfsg.learn.region_physics import RegionPhysics
 from rfsg.learn.regions import (
     QUALITY,
     RECEIVERS,
     REGIONS,
     Budget,
-    RegionPhysics,
     fit_regions,
     friis_db,
     region_scene,
