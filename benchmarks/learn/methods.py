@@ -27,7 +27,8 @@ FOLDER = Path(baselines.__file__).parent
 class Entry:
     """``said`` goes on the page, and so does ``budget``, in steps or minutes, where there is one.
 
-    ``version`` tells results of one code and budget from those of another.
+    ``version`` tells results of one code and budget from those of another. ``data_set``: the only one
+    that the method is for, if there is one.
     """
 
     make: Callable[[Case], Method]
@@ -35,6 +36,10 @@ class Entry:
     said: str
     budget: str = ""
     baseline: bool = True
+    data_set: str = ""
+
+    def serves(self, case: Case) -> bool:
+        return self.data_set in ("", case.data_set)
 
 
 def version(*names: str, budget: str = "") -> str:

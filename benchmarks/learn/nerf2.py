@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -77,29 +78,87 @@ def gateway_positions(path: Path) -> dict[str, list[float]]:
 
 
 def cases(folder: Path, crops: Sequence[str] = ()) -> Iterator[Case]:
-    """Every run of splits.json, or those of some crops. Raises DataError for an unknown crop."""
+    """Every run of splits.json, or those of some crops.
+
+    Raises DataError for an unknown crop, and for what is not as expected in the files.
+    """
     data = read(folder)
     path = folder / "splits.json"
-    if not path.is_file():
-        raise DataError(f"{path}: not found; --data expects the folder of a data set")
-    known = json.loads(path.read_text())["crops"]
+    known = under(path, "", read_json(path), "crops", dict)
     unknown = sorted(set(crops) - set(known))
     if unknown:
         raise DataError(
             f"{path}: no crop {', '.join(unknown)}; --crops expects some of {', '.join(known)}"
         )
-    number_of = {name: i for i, name in enumerate(data.gateways)}
     for crop in crops or known:
-        for run in known[crop]["runs"]:
-            asked = [run["test_gateway"]] if "test_gateway" in run else known[crop]["gateways"]
-            train = [(row, number_of[gateway]) for row, gateway in run["train"]]
-            test = [(row, number_of[g]) for row in run["test_rows"] for g in asked]
-            yield Case(
-                NAME,
-                crop,
-                run["split"],
-                run["density"],
-                run["seed"],
-                data.readings(train),
-                data.readings(test),
-            )
+        where = f"crops.{crop}"
+        of_crop = under(path, "crops", known, crop, dict)
+        gateways = under(path, where, of_crop, "gateways", list)
+        for i, run in enumerate(under(path, where, of_crop, "runs", list)):
+            yield case(data, crop, gateways, Run(path, f"{where}.runs[{i}]", run))
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of splits.json: the file, where it stands in it, and what is there."""
+
+    path: Path
+    where: str
+    content: object
+
+    def get(self, key: str, kind: type | tuple[type, ...]) -> Any:
+        return under(self.path, self.where, self.content, key, kind)
+
+    def fault(self, key: str, given: object, expected: str) -> DataError:
+        return DataError(f"{self.path}: {self.where}.{key}: {given!r}; expected {expected}")
+
+    def pair(self, key: str, pair: object, data: Nerf2Ble) -> tuple[int, int]:
+        """[row of tidy.csv, name of a gateway] as numbers."""
+        if not isinstance(pair, list) or len(pair) != 2:
+            raise self.fault(key, pair, "a pair [row, gateway]")
+        row, gateway = pair
+        if type(row) is not int or not 0 <= row < len(data.place):
+            raise self.fault(key, row, f"a row of tidy.csv, 0 to {len(data.place) - 1}")
+        if gateway not in data.gateways:
+            raise self.fault(key, gateway, f"a gateway: {', '.join(data.gateways)}")
+        return row, data.gateways.index(gateway)
+
+
+def case(data: Nerf2Ble, crop: str, gateways: list[str], run: Run) -> Case:
+    """The case of a run; ``gateways`` are asked where it names no test gateway."""
+    named = isinstance(run.content, dict) and "test_gateway" in run.content
+    asked = [run.get("test_gateway", str)] if named else gateways
+    rows = run.get("test_rows", list)
+    return Case(
+        NAME,
+        crop,
+        run.get("split", str),
+        run.get("density", (int, float)),
+        run.get("seed", int),
+        data.readings([run.pair("train", pair, data) for pair in run.get("train", list)]),
+        data.readings([run.pair("test_rows", [row, g], data) for row in rows for g in asked]),
+    )
+
+
+def read_json(path: Path) -> object:
+    """Raises DataError, naming the line, for what is no JSON."""
+    if not path.is_file():
+        raise DataError(f"{path}: not found; --data expects the folder of a data set")
+    try:
+        return json.loads(path.read_text())
+    except json.JSONDecodeError as fault:
+        raise DataError(f"{path}: line {fault.lineno}: {fault.msg}; expected JSON") from None
+
+
+WORDS = {dict: "an object", list: "a list", str: "text", int: "a whole number"}
+
+
+def under(path: Path, where: str, content: object, key: str, kind: type | tuple[type, ...]) -> Any:
+    """What an object of a JSON file has at a key. Raises DataError when it has none, or another kind."""
+    expected = WORDS.get(kind, "a number") if isinstance(kind, type) else "a number"
+    place = f"{path}: {where}.{key}" if where else f"{path}: {key}"
+    if not isinstance(content, dict) or key not in content:
+        raise DataError(f"{place}: not there; expected {expected}")
+    if not isinstance(content[key], kind):
+        raise DataError(f"{place}: {content[key]!r:.60}; expected {expected}")
+    return content[key]

@@ -1,4 +1,8 @@
-"""Model only what a scene requires: the richer of two physics only where held-out places ask for it."""
+"""Model only what a scene requires: the richer of two methods only where held-out places ask for it.
+
+Required(FreeSpace(), RegionPhysics())          # regions, or the empty scene
+Required(physics, Residual(physics))            # what physics leaves, or physics alone
+"""
 
 from dataclasses import dataclass
 
@@ -18,7 +22,7 @@ EVERY = 5  # one place in so many is held out for the choice
 
 @dataclass(frozen=True)
 class Required:
-    """Settings: two physics, and the scale [dB] of the Student cost by which they are compared."""
+    """Settings: two methods, and the scale [dB] of the Student cost by which they are compared."""
 
     plain: Method
     rich: Method
@@ -53,7 +57,7 @@ class Required:
 
 @dataclass(frozen=True)
 class RequiredModel:
-    """The physics that was needed, whether it is the ``rich`` one, and what it missed [dB].
+    """The method that was needed, whether it is the ``rich`` one, and what it missed [dB].
 
     ``missed`` is of readings that it had not seen, where there were enough places for that.
     """
@@ -68,13 +72,15 @@ class RequiredModel:
         rx_position: Float[ndarray, "n 3"],
         gateway: Int[ndarray, "n"],
     ) -> IntervalPrediction:
-        """What the physics says [dBm], with the 90 % interval that ``missed`` has about it.
+        """What the physics says [dBm], with its own 90 % interval, or that of ``missed`` about it.
 
-        Split-conformal bounds, 5 % on either side (V. Vovk, A. Gammerman, G. Shafer, Algorithmic
-        Learning in a Random World, Springer 2005). Raises ValueError when lengths differ or a position
-        is not finite.
+        The latter is split-conformal, 5 % on either side (V. Vovk, A. Gammerman, G. Shafer,
+        Algorithmic Learning in a Random World, Springer 2005). Raises ValueError when lengths differ
+        or a position is not finite.
         """
         said = self.physics.predict(tx_position, rx_position, gateway)
+        if isinstance(said, IntervalPrediction):
+            return said
         low, high = bounds(self.missed)
         std = np.full(len(said.mean), np.sqrt(np.mean(self.missed**2)))
         return IntervalPrediction(said.mean, std, said.mean + low, said.mean + high)

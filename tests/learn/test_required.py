@@ -9,6 +9,7 @@ from rfsg.learn.baselines import Prediction, Readings
 from rfsg.learn.free_space import FreeSpace, gain_db, location
 from rfsg.learn.levels import Places
 from rfsg.learn.losses import student
+from rfsg.learn.mixture import IntervalPrediction
 from rfsg.learn.required import EVERY, Required, better, bounds
 from rfsg.scene.scene import Scene
 
@@ -119,6 +120,21 @@ def test_the_interval_covers_nine_tenths():
     inside = ((said.low <= truth) & (truth <= said.high)).mean()
     # 900 calibrating readings: three standard errors of theirs and of the 3000 asked
     assert inside == pytest.approx(0.9, abs=0.035)
+
+
+def test_a_method_that_knows_its_interval_keeps_it():
+    class Sure(Shifted):
+        def predict(self, tx_position, rx_position, gateway):
+            mean = slope(tx_position)
+            return IntervalPrediction(mean, None, mean - 7.0, mean + 9.0)
+
+    where = links(60)
+    valued_there = valued(where, slope(where.tx_position))
+    found = Required(Shifted(slope, 5.0), Sure(slope, 0.0)).fit(valued_there)
+    said = found.predict(where.tx_position, where.rx_position, where.gateway)
+    assert (
+        found.rich and (said.low == said.mean - 7.0).all() and (said.high == said.mean + 9.0).all()
+    )
 
 
 def test_bounds_are_order_statistics():
