@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 import rfsg
+from rfsg.learn.losses import Losses
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.stochastic import StochasticSurface
 
@@ -52,8 +53,10 @@ fitted = rfsg.fit(
     seen,
     select=[f"{CABINET}.surface"],
     steps=400,
+    batch=16,
     learning_rate=3e-3,
     schedule="cosine",
+    losses=Losses(law="student"),
     quality=quality,
 )
 print(f"{fitted.report['readings']['say_something']} readings met the cabinet")

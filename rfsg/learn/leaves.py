@@ -16,13 +16,16 @@ from rfsg.scene.scene import Scene
 HEADS = ("m", "alpha", "phi", "bulk")
 POWER = "power.offset_db"
 # Steps of a rate of 1e-4 (the paper's, for weights) in each quantity's own unit: a logarithm moves by
-# 0.1 %, eps_r by 0.01, a pose by 1 mm or 1 mrad, an offset by 0.01 dB.
+# 0.1 %, eps_r by 0.01, a pose by 1 mm or 1 mrad, an offset by 0.01 dB. The heads of a field add up 128
+# features of one sign: what Adam moves each weight by moves the field by a hundred times that, so their
+# step falls with the width (G. Yang et al., Tensor Programs V, 2022, Table 3); with the full one fields
+# ran to the ends of their ranges, where no slope is left (docs/learning-ablations.md).
 RATES = {
     "weights": 1.0,
-    "m": 1.0,
-    "alpha": 1.0,
-    "phi": 1.0,
-    "bulk": 1.0,
+    "m": 0.1,
+    "alpha": 0.1,
+    "phi": 0.1,
+    "bulk": 0.1,
     "s": 10.0,
     "interaction_length": 10.0,
     "eps_r": 100.0,

@@ -194,7 +194,7 @@ class Budget:
 
     steps: int = 150
     batch: int = 64
-    learning_rate: float = 2e-3
+    learning_rate: float = 2e-2
     offset_rate: float = 0.2
     receiver_gains: bool = True
     losses: Losses = field(default_factory=lambda: Losses(noise_db=4.0, law="huber"))

@@ -38,7 +38,7 @@ GATEWAYS = torch.tensor(
 )
 # The occupancy of a blurred box is 1/2 + s d / 4 a metre's depth d in: so much is told of lengths.
 OCCUPIED = 2e-4
-SHORT = Budget(steps=35, batch=32, learning_rate=5e-3, offset_rate=0.4)
+SHORT = Budget(steps=35, batch=32, learning_rate=5e-2, offset_rate=0.4)
 BLOCK, HALF = (4.0, 5.0, 1.5), (0.9, 1.1, 3.0)
 
 
@@ -222,7 +222,7 @@ def test_readings_of_moved_positions_teach_the_same():
     same too; float32 rounding of local coordinates remains, grown over the steps: 0.05 dB."""
     tx, unseen = places(16, 7), places(8, 8)
     move = Pose.at(31.0, -17.0, 4.0, 37.0)
-    method = RegionPhysics(cell_m=6.0, budget=Budget(steps=10, learning_rate=1e-2))
+    method = RegionPhysics(cell_m=6.0, budget=Budget(steps=10, learning_rate=1e-1))
     here = readings(tx, truth(tx, block()))
     asked = readings(unseen, friis(unseen, GATEWAYS))
     still = said(method.fit(here), asked)
