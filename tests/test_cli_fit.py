@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from rfsg import cli
+from rfsg.cli.fit import risen
 from rfsg.learn.measurements import Measurements
 from rfsg.learn.model import load
 from rfsg.scene.scene import Scene
@@ -46,6 +47,14 @@ def test_files_become_files(files, capsys):
     assert run(files, *select, "--resume", "--steps", "6") == 0
     assert "with residual" not in capsys.readouterr().out
     assert not (out / "residual.safetensors").exists()
+
+
+def test_a_fit_that_made_it_worse_says_so():
+    def report(before, after):
+        return {"train": {"before": {"median_db": before}, "after": {"median_db": after}}}
+
+    assert "rose from 2.00 to 3.50 dB" in risen(report(2.0, 3.5))
+    assert not risen(report(3.5, 2.0)) and not risen(report(None, None))
 
 
 def test_what_cannot_be_learned_is_said(files, capsys):

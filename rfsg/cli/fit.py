@@ -148,8 +148,22 @@ def finish(fitted: "Fitted", out: Path) -> None:
         print_table("intervals", rows)
     for cause, count in fitted.report["refused_steps"].items():
         note(f"{count} steps were refused: {cause} was not finite")
+    if said := risen(fitted.report):
+        note(said)
     files = FILES if fitted.report["residual"] is None else (*FILES, "residual.safetensors")
     print_files(out, (*files, *pictures))
+
+
+def risen(report: dict[str, Any]) -> str:
+    """What to say of a fit whose training error is larger than before it; "" of any other."""
+    before, after = (report["train"][when]["median_db"] for when in ("before", "after"))
+    if before is None or after is None or after <= before:
+        return ""
+    return (
+        f"the median training error rose from {before:.2f} to {after:.2f} dB: nothing was learned. Likely "
+        "causes: a rate that is too high (--rate), batches too small (--batch 16), a few readings far off "
+        "(--law student), or a scene that lacks what the readings saw"
+    )
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
