@@ -18,8 +18,8 @@ POWER = "power.offset_db"
 # Steps of a rate of 1e-4 (the paper's, for weights) in each quantity's own unit: a logarithm moves by
 # 0.1 %, eps_r by 0.01, a pose by 1 mm or 1 mrad, an offset by 0.01 dB. The heads of a field add up 128
 # features of one sign: what Adam moves each weight by moves the field by a hundred times that, so their
-# step falls with the width (G. Yang et al., Tensor Programs V, 2022, Table 3); with the full one fields
-# ran to the ends of their ranges, where no slope is left (docs/learning-ablations.md).
+# step falls with the width (G. Yang et al., Tensor Programs V, 2022, Table 3). With the full one some fits
+# ran to the ends of their ranges, where no slope is left; others did better (docs/learning-ablations.md).
 RATES = {
     "weights": 1.0,
     "m": 0.1,
