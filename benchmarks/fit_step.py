@@ -67,7 +67,8 @@ def main() -> None:
         ms = [1e3 * s for s in training.seconds[5:]]
         low, _, high = statistics.quantiles(ms, n=4)
         print(
-            f"{name:34} median {statistics.median(ms):6.1f} ms (quartiles {low:.1f} to {high:.1f}), "
+            f"{name:34} mean {statistics.mean(ms):6.1f} ms, median {statistics.median(ms):6.1f} ms "
+            f"(quartiles {low:.1f} to {high:.1f}), "
             f"CPU {statistics.median(spent[name][5:]):.1f} ms; "
             f"{int(kept.live.sum())} of {len(kept.link)} paths live, {int(kept.traced.sum())} "
             f"solved again; search {search:.1f} s"

@@ -21,11 +21,16 @@ STENCIL = 0.02  # of the half diagonal: the step of the discrete Laplacian
 
 @dataclass(frozen=True)
 class Regularisation:
-    """Weights of the terms (0 leaves one out), and how many points each object is asked at a step."""
+    """Weights of the terms (0 leaves one out), and how many points each object is asked.
+
+    every: steps from one asking to the next. They are 30 % of a step's time; asked more rarely and so
+    many times as strongly, what they ask for is the same in the mean.
+    """
 
     laplacian: float = 1e-4
     eikonal: float = 0.1
     points: int = 16
+    every: int = 4
 
     def __post_init__(self) -> None:
         for name in ("laplacian", "eikonal"):
@@ -33,8 +38,11 @@ class Regularisation:
                 raise LearnError(
                     f"regularisation: {name}={getattr(self, name)!r}: expected a number >= 0"
                 )
-        if self.points < 1:
-            raise LearnError(f"regularisation: points={self.points!r}: expected at least 1")
+        for name in ("points", "every"):
+            if getattr(self, name) < 1:
+                raise LearnError(
+                    f"regularisation: {name}={getattr(self, name)!r}: expected at least 1"
+                )
 
 
 def random_points(body: Body, count: int, generator: torch.Generator) -> Float[Tensor, "count 3"]:

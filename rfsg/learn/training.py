@@ -217,6 +217,8 @@ class Training:
 
     def _regularisation(self, step: int) -> Tensor:
         how, total = self.settings.regularisation, torch.zeros((), dtype=torch.float64)
+        if step % how.every:
+            return total
         generator = _generator(self.settings.seed + 1, step)
         for body, shape, surface in self.asked:
             point = random_points(body, how.points, generator).float()
@@ -224,7 +226,7 @@ class Training:
                 total = total + how.laplacian * laplacian(body, point, shape=shape, surface=surface)
             if how.eikonal and shape:
                 total = total + how.eikonal * eikonal(body, point)
-        return total
+        return how.every * total
 
     def _gradients(self, total: Tensor) -> list[Tensor]:
         if not total.requires_grad:

@@ -28,6 +28,7 @@ from rfsg.learn.training import Settings, Training
 from rfsg.objects.body import Body
 from rfsg.objects.shapes.neural import NeuralShape
 from rfsg.objects.surfaces.interface import Conductor
+from rfsg.objects.surfaces.stochastic import StochasticSurface
 from rfsg.scene.scene import SceneError
 from tests.learn.rooms import (
     QUALITY,
@@ -65,6 +66,26 @@ def training(scene, measured, patterns, **options) -> Training:
     standard = {"quality": QUALITY, "batch": len(measured), "regularisation": NONE}
     settings = Settings(exact=True, **{**standard, **options})
     return Training(scene, selection, measured, links, held, settings)
+
+
+def test_smoothness_is_asked_seldom_and_as_strongly_in_the_mean():
+    """At a step that asks, so many times what one asking costs; nothing at the others."""
+    start = room_with(thing(StochasticSurface()), count=4)
+    each, seldom = (
+        training(
+            start,
+            readings(start, "rssi"),
+            ["/thing.surface"],
+            regularisation=Regularisation(every=k),
+        )
+        for k in (1, 3)
+    )
+    for asked in (each, seldom):
+        asked.search()
+    for step in range(7):
+        once, now = (float(t._regularisation(step).detach()) for t in (each, seldom))
+        assert once > 0
+        assert now == (pytest.approx(3.0 * once) if step % 3 == 0 else 0.0)
 
 
 # truths come back

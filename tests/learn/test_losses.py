@@ -167,6 +167,8 @@ def test_options_out_of_range_are_refused():
         Losses(law="cauchy")
     with pytest.raises(LearnError, match="laplacian"):
         Regularisation(laplacian=-1.0)
+    with pytest.raises(LearnError, match="every=0"):
+        Regularisation(every=0)
 
 
 def test_the_laplacian_of_a_ball_is_its_closed_form():
