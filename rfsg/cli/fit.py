@@ -14,8 +14,6 @@ from rfsg.cli.terminal import bar, note, print_files, print_table
 if TYPE_CHECKING:
     from rfsg.learn.fit import Fitted
 
-FILES = ("scene.usda", "history.csv", "predictions.csv", "measurements.csv", "report.json")
-
 
 class Law(StrEnum):
     gaussian = "gaussian"
@@ -142,6 +140,8 @@ def fit(
 
 def finish(fitted: "Fitted", out: Path) -> None:
     """Pictures, and what a person wants to know of a fit that was written to ``out``."""
+    from rfsg.learn.output import FILES
+
     pictures = _draw(fitted, out)
     print_table("errors", _errors(fitted.report))
     if rows := _intervals(fitted.report):
@@ -150,8 +150,8 @@ def finish(fitted: "Fitted", out: Path) -> None:
         note(f"{count} steps were refused: {cause} was not finite")
     if said := risen(fitted.report):
         note(said)
-    files = FILES if fitted.report["residual"] is None else (*FILES, "residual.safetensors")
-    print_files(out, (*files, *pictures))
+    written = [name for name in FILES if (out / name).exists()]
+    print_files(out, (*written, *pictures))
 
 
 def risen(report: dict[str, Any]) -> str:

@@ -38,9 +38,6 @@ from rfsg.tracer.records import Act, Channel, Paths
 from rfsg.tracer.simulate import positions, simulate, world_for
 
 DEEPER_DB = 40.0  # below the floor: what a learned object hides today may matter when it is learned
-DARKEST = (
-    1e-30  # share of the power below which a coefficient counts as this, where its log is asked
-)
 AT_ONCE = 16_384  # paths evaluated together where no gradient is asked for
 Progress = Callable[[str], None]
 
