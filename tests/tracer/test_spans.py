@@ -9,6 +9,7 @@ from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World
+from rfsg.tracer.boxes import layers_of, touching
 from rfsg.tracer.embree import Proxies, brute_spans
 from rfsg.tracer.launch import fibonacci
 from rfsg.tracer.records import Rays
@@ -64,7 +65,56 @@ def _scenes():
 
 @pytest.mark.parametrize("name", ["flush", "inset", "stacked", "nested", "crowd", "far"])
 def test_spans_are_complete(name):
-    nodes = _scenes()[name]
+    _complete(_scenes()[name])
+
+
+def test_spans_are_complete_where_a_floor_touches_everything():
+    """The floor and the lid are hubs: proposed to every ray, not by every box that stands on them."""
+    nodes = _hall(60)
+    _complete(nodes)
+    (layer,) = layers_of(_corners(nodes))
+    assert set(layer.boxes.hubs.tolist()) == {60, 61}
+
+
+def test_spans_are_complete_after_moves():
+    """What did not move is not built again; what moved, came or went is right all the same."""
+    nodes = _hall(60)
+    _complete(nodes)
+    (built,) = layers_of(_corners(nodes))
+    gone = [n for k, n in enumerate(nodes) if k not in (3, 61)]
+    moved = [*gone[:5], box_node("/new", (0.3, 0.2, 0.6), (0.4, 0.1, 0.5)), *gone[5:]]
+    moved[8] = box_node("/c8", (0.5, -0.2, 0.4), (0.3, 0.3, 0.4), yaw_deg=20.0)
+    moved[9] = moved[10]  # two at one place: one of them stood there before
+    standing, few = layers_of(_corners(moved))
+    assert standing.boxes is built.boxes
+    assert sorted(few.owner.tolist()) == [5, 8, 10]
+    _complete(tuple(moved))
+
+
+def test_touching_boxes_are_found_as_by_looking_at_every_pair():
+    torch.manual_seed(5)
+    corners = torch.rand(300, 1, 3).double() * 9 + torch.rand(300, 8, 3).double()
+    low, high = corners.amin(1) - 1e-3, corners.amax(1) + 1e-3
+    every = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(-1).triu(1)
+    first, second = touching(corners, 1e-3)
+    found = set(zip(*(torch.stack([first, second]).sort(0).values.tolist()), strict=True))
+    assert found == set(map(tuple, every.nonzero().tolist())) and len(found) == len(first) > 100
+
+
+def _hall(count):
+    things = tuple(
+        box_node(f"/c{k}", (k % 8 - 3.5, k // 8 - 3.5, 0.5), (0.3, 0.2, 0.5)) for k in range(count)
+    )
+    floor = box_node("/floor", (0, 0, -0.1), (5.0, 5.0, 0.1))
+    return (*things, floor, box_node("/lid", (0, 0, 1.1), (5.0, 5.0, 0.1)))
+
+
+def _corners(nodes):
+    proxies = Proxies(World(Scene(tuple(nodes))))
+    return proxies.corners(proxies.owner)
+
+
+def _complete(nodes):
     world = World(Scene(nodes))
     middle = torch.stack([n.pose.translation for n in nodes]).mean(0)
     torch.manual_seed(1)
