@@ -24,11 +24,15 @@ class Adam:
         """One update by finite ``gradients``, each shaped as its parameter."""
         self.steps += 1
         grown = math.sqrt(1 - SECOND**self.steps) / (1 - FIRST**self.steps)
-        every = zip(self.parameters, gradients, self.first, self.second, self.rates, strict=True)
-        for p, gradient, first, second, own in every:
-            first.lerp_(gradient, 1 - FIRST)
-            second.mul_(SECOND).addcmul_(gradient, gradient, value=1 - SECOND)
-            p.addcdiv_(first, second.sqrt().add_(TINY), value=-rate * own * grown)
+        given = list(gradients)
+        torch._foreach_lerp_(self.first, given, 1 - FIRST)
+        torch._foreach_mul_(self.second, SECOND)
+        torch._foreach_addcmul_(self.second, given, given, value=1 - SECOND)
+        spread = torch._foreach_sqrt(self.second)
+        torch._foreach_add_(spread, TINY)
+        strides = [-rate * own * grown for own in self.rates]
+        tensors: list[Tensor] = [*self.parameters]
+        torch._foreach_addcdiv_(tensors, self.first, spread, strides)
 
     def tensors(self) -> dict[str, Tensor]:
         """The whole state, by name."""

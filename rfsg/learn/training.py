@@ -242,6 +242,8 @@ class Training:
         """What of a step is not finite, if anything."""
         if not bool(torch.isfinite(total)):
             return "loss"
+        if all(float(torch.dot(g, g)) < STEEPEST**2 for g in (g.reshape(-1) for g in gradients)):
+            return None  # the square of every slope is below that of their sum
         for p, gradient in zip(self.parameters, gradients, strict=True):
             if not bool((gradient.abs() < STEEPEST).all()):
                 leaf = next(f for f in self.selection.leaves if any(t is p for t in f.tensors))

@@ -204,14 +204,14 @@ def learned():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(geometry, "NEAR_POOL", 20_000)
         patch.setattr(geometry, "FAR_POOL", 10_000)
-        return geometry.learn_shape(ball(), steps=300, seed=1)
+        return geometry.learn_shape(ball(), steps=300, seed=2)
 
 
 def test_a_ball_is_learned_in_seconds(learned):
     shape, report = learned
     assert report.surface_mean_mm < 4 and report.surface_p95_mm < 12
     assert abs(report.volume_error_percent) < 6
-    assert report.steps == 300 and report.seed == 1
+    assert report.steps == 300 and report.seed == 2
     point = scattered(2000, 0.84)
     assert (shape.sdf(point) - BALL.sdf(point)).abs().mean() < 0.03
 
@@ -234,12 +234,11 @@ def test_the_report_of_a_perfect_shape_has_no_error():
     """The exact distance stands in for the network."""
 
     class Exact(NeuralShape):
-        def _value_gradient_feature(self, point, w, with_feature=True):
-            value, gradient = Box([0.2, 0.3, 0.5]).value_and_gradient(point)
-            return value, gradient
+        def value_and_gradient(self, point):
+            return Box([0.2, 0.3, 0.5]).value_and_gradient(point)
 
-        def _value(self, point, w):
-            return (Box([0.2, 0.3, 0.5]).sdf(point),)
+        def sdf(self, point):
+            return Box([0.2, 0.3, 0.5]).sdf(point)
 
     shape = Exact([[-0.3, -0.4, -0.6], [0.3, 0.4, 0.6]], lipschitz=1.0)
     report = geometry.measure(shape, MeshDistance(box()), seconds=0.0, steps=1, seed=0)

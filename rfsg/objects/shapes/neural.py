@@ -6,11 +6,13 @@ skip connection, to f [m] and a 128-vector h that describes the neighbourhood to
 Two things differ from the usual code for such a network. The activation is squareplus,
 (x + sqrt(x^2 + b)) / 2 (Barron 2021): smooth, so that curvature exists, and a third of the price of
 softplus on a CPU. And value, gradient and Hessian are swept by hand instead of by autograd, so that
-they cost about 1, 2 and 6 evaluations, work without a graph, and can still be differentiated.
+they cost about 1, 2 and 6 evaluations, work without a graph, and can still be differentiated: value,
+gradient and features as one node (``sweeps``), the Hessian by a graph of all that it is made of.
 """
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -18,10 +20,11 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from rfsg.objects.contract import Jet
+from rfsg.objects.shapes.sweeps import SHARE, Question, ShapeSweep, answer
 
-# Points per sweep when no gradients are recorded: activations of 4096 x 64 float32 stay in the
-# cache of a CPU core (twice as fast as 262144 at a time); a GPU wants many more.
-CPU_CHUNK, GPU_CHUNK = 4_096, 262_144
+# Points per sweep when no gradients are recorded: activations of 1024 x 64 float32 stay in the
+# cache of a CPU core; a GPU wants many more.
+CPU_CHUNK, GPU_CHUNK = 1_024, 262_144
 
 
 class NeuralShape(nn.Module):
@@ -96,31 +99,32 @@ class NeuralShape(nn.Module):
 
     def sdf(self, point: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Mean implicit function f [m], negative inside."""
-        (value,) = self._swept(self._value, point)
+        (value,) = self._answers(point, value=True)
         return value
 
     def feature(self, point: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b h"]:
         """The vector h that describes the neighbourhood of a point to the material network."""
-        (feature,) = self._swept(self._feature, point)
+        (feature,) = self._answers(point, feature=True)
         return feature
 
     def value_and_gradient(
         self, point: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"]]:
         """f [m] and its gradient [1] by one reverse sweep."""
-        value, gradient = self._swept(self._value_and_gradient, point)
+        value, gradient = self._answers(point, value=True, gradient=True)
         return value, gradient
 
     def value_gradient_feature(
         self, point: Float[Tensor, "*b 3"]
     ) -> tuple[Float[Tensor, "*b"], Float[Tensor, "*b 3"], Float[Tensor, "*b h"]]:
         """f [m], its gradient [1] and h in one sweep."""
-        value, gradient, feature = self._swept(self._value_gradient_feature, point)
+        value, gradient, feature = self._answers(point, value=True, gradient=True, feature=True)
         return value, gradient, feature
 
     def jet(self, point: Float[Tensor, "*b 3"]) -> Jet:
         """f to second order: Hessian = sum over layers of J^T diag(adjoint * activation'') J."""
-        return Jet(*self._swept(self._jet, point))
+        weights = self._parameters_in_turn()
+        return Jet(*_in_chunks(lambda flat: self._jet(flat, _Weights(self, weights, flat)), point))
 
     def normal_at(self, point: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
         """Unit vector along the gradient; zero where the gradient is zero."""
@@ -179,39 +183,45 @@ class NeuralShape(nn.Module):
         self.to_value.weight.div_(slope)
         self.to_value.bias.sub_(value.mean() / self._reach / slope)
 
-    def _swept(
-        self, sweep: Callable[[Tensor, "_Weights"], tuple[Tensor, ...]], point: Tensor
+    def _answers(
+        self, point: Tensor, *, value: bool = False, gradient: bool = False, feature: bool = False
     ) -> tuple[Tensor, ...]:
-        """Run a sweep over any batch of points, in chunks where no graph is recorded."""
-        flat = point.reshape(-1, 3)
-        weights = _Weights(self, flat)
-        chunk = CPU_CHUNK if flat.device.type == "cpu" else GPU_CHUNK
-        if torch.is_grad_enabled() or len(flat) <= chunk:
-            parts = sweep(flat, weights)
-        else:
-            pieces = [sweep(piece, weights) for piece in flat.split(chunk)]
-            parts = tuple(torch.cat(column) for column in zip(*pieces, strict=True))
-        return tuple(part.reshape(point.shape[:-1] + part.shape[1:]) for part in parts)
+        """What is asked of any batch of points: as one node where a graph is recorded."""
+        weights = self._parameters_in_turn()
+        asked = Question(
+            self.skip,
+            self.softness,
+            self._centre.to(point.dtype),
+            self._reach.to(point.dtype),
+            self._octaves.to(point.dtype),
+            value,
+            gradient,
+            feature,
+        )
+        plain = partial(self._plain, asked)
+        node = partial(ShapeSweep.apply, plain, asked)
+        recorded = point.requires_grad or any(w.requires_grad for w in weights)
+        sweep = node if recorded and torch.is_grad_enabled() else partial(answer, asked)
+        return _in_chunks(lambda flat: sweep(flat, *weights), point)
 
-    def _value(self, point: Tensor, w: "_Weights") -> tuple[Tensor]:
-        return (w.value(self._forward(self._encode(point, w)[0], w)),)
+    def _parameters_in_turn(self) -> list[Tensor]:
+        """(weight, bias) of each hidden layer, of the value and of the features."""
+        layers = [*self.hidden, self.to_value, self.to_feature]
+        return [t for layer in layers for t in (layer.weight, layer.bias)]
 
-    def _feature(self, point: Tensor, w: "_Weights") -> tuple[Tensor]:
-        return (F.linear(self._forward(self._encode(point, w)[0], w), *w.feature),)
-
-    def _value_and_gradient(self, point: Tensor, w: "_Weights") -> tuple[Tensor, ...]:
-        return self._value_gradient_feature(point, w, with_feature=False)
-
-    def _value_gradient_feature(
-        self, point: Tensor, w: "_Weights", with_feature: bool = True
-    ) -> tuple[Tensor, ...]:
+    def _plain(self, asked: Question, point: Tensor, *weights: Tensor) -> tuple[Tensor, ...]:
+        """What is asked, every operation by itself: ``answer`` for derivatives of any order."""
+        w = _Weights(self, weights, point)
         encoded, sine, cosine = self._encode(point, w)
         tape: list[tuple[Tensor, Tensor]] = []
         last = self._forward(encoded, w, tape)
-        adjoint, _ = self._reverse(tape, w)
-        gradient = _encoding_slope(adjoint, sine, cosine, w.octaves)
-        value = w.value(last)
-        return (value, gradient, F.linear(last, *w.feature)) if with_feature else (value, gradient)
+        answers = [w.value(last)] if asked.value else []
+        if asked.gradient:
+            adjoint, _ = self._reverse(tape, w)
+            answers.append(_encoding_slope(adjoint, sine, cosine, w.octaves))
+        if asked.feature:
+            answers.append(F.linear(last, *w.feature))
+        return tuple(answers)
 
     def _jet(self, point: Tensor, w: "_Weights") -> tuple[Tensor, Tensor, Tensor]:
         encoded, sine, cosine = self._encode(point, w)
@@ -223,7 +233,7 @@ class NeuralShape(nn.Module):
         tangent = first = _encoding_tangent(sine, cosine, w.octaves)
         for i, (weight, _) in enumerate(w.hidden):
             if i == self.skip:
-                tangent = torch.cat([tangent, first], -1) * math.sqrt(0.5)
+                tangent = torch.cat([tangent, first], -1) * SHARE
             tangent = tangent @ weight.mT
             slope, root = tape[i]
             curved = back[i] * (0.5 * self.softness) / (root * root * root)
@@ -238,19 +248,16 @@ class NeuralShape(nn.Module):
         sine, cosine = phase.sin(), phase.cos()
         return torch.cat([own, sine.flatten(1), cosine.flatten(1)], -1), sine, cosine
 
-    def _forward(
-        self, encoded: Tensor, w: "_Weights", tape: list[tuple[Tensor, Tensor]] | None = None
-    ) -> Tensor:
+    def _forward(self, encoded: Tensor, w: "_Weights", tape: list[tuple[Tensor, Tensor]]) -> Tensor:
         """Last hidden activations; ``tape`` receives (activation', sqrt(x^2 + b)) of each layer."""
         x = encoded
         for i, (weight, bias) in enumerate(w.hidden):
             if i == self.skip:
-                x = torch.cat([x, encoded], -1) * math.sqrt(0.5)
+                x = torch.cat([x, encoded], -1) * SHARE
             x = F.linear(x, weight, bias)
             root = torch.addcmul(w.softness, x, x).sqrt()
             x = torch.lerp(x, root, 0.5)
-            if tape is not None:
-                tape.append((x / root, root))
+            tape.append((x / root, root))
         return x
 
     def _reverse(
@@ -264,7 +271,7 @@ class NeuralShape(nn.Module):
             back.append(adjoint)
             adjoint = (adjoint * tape[i][0]) @ w.hidden[i][0]
             if i == self.skip:
-                adjoint = adjoint * math.sqrt(0.5)
+                adjoint = adjoint * SHARE
                 encoded = adjoint[:, self.width :]
                 adjoint = adjoint[:, : self.width]
         return adjoint + encoded, back[::-1]
@@ -273,20 +280,28 @@ class NeuralShape(nn.Module):
 class _Weights:
     """A network's weights in the precision of the points, cast once per call."""
 
-    def __init__(self, shape: NeuralShape, like: Tensor):
-        def cast(layer: nn.Module) -> tuple[Tensor, Tensor]:
-            assert isinstance(layer, nn.Linear)
-            return layer.weight.to(like.dtype), layer.bias.to(like.dtype)
-
-        self.hidden = [cast(layer) for layer in shape.hidden]
-        self.value_weight, self.value_bias = cast(shape.to_value)
-        self.feature = cast(shape.to_feature)
+    def __init__(self, shape: NeuralShape, weights: Sequence[Tensor], like: Tensor):
+        cast = [t.to(like.dtype) for t in weights]
+        pairs = list(zip(cast[::2], cast[1::2], strict=True))
+        *self.hidden, (self.value_weight, self.value_bias), self.feature = pairs
         self.centre, self.reach = shape._centre.to(like.dtype), shape._reach.to(like.dtype)
         self.octaves = shape._octaves.to(like.dtype)
         self.softness = like.new_tensor(shape.softness)
 
     def value(self, last: Tensor) -> Tensor:
         return F.linear(last, self.value_weight, self.value_bias).squeeze(-1) * self.reach
+
+
+def _in_chunks(sweep: Callable[[Tensor], tuple[Tensor, ...]], point: Tensor) -> tuple[Tensor, ...]:
+    """Run a sweep over any batch of points, in chunks where no graph is recorded."""
+    flat = point.reshape(-1, 3)
+    chunk = CPU_CHUNK if flat.device.type == "cpu" else GPU_CHUNK
+    if torch.is_grad_enabled() or len(flat) <= chunk:
+        parts = sweep(flat)
+    else:
+        pieces = [sweep(piece) for piece in flat.split(chunk)]
+        parts = tuple(torch.cat(column) for column in zip(*pieces, strict=True))
+    return tuple(part.reshape(point.shape[:-1] + part.shape[1:]) for part in parts)
 
 
 def _split(adjoint: Tensor, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,13 +11,12 @@ mirror keeps sqrt(alpha) R. Where it is not, the mirror carries the whole of R, 
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
-from torch.nn.functional import linear
 
 from rfsg.objects.contract import Contact, Crossing, Shape
 from rfsg.objects.physics import transport
@@ -28,6 +27,7 @@ from rfsg.objects.surfaces.interface import (
     crossing_cosines,
     crossing_direction,
 )
+from rfsg.objects.sweeps import swept_heads
 
 WIDTH = 128  # of the material network, and of the shape's feature h (paper section 5.1)
 LAYERS = 8
@@ -259,10 +259,9 @@ class StochasticSurface(nn.Module):
         chunks = (flat,) if torch.is_grad_enabled() else flat.split(CHUNK)
         parts = [self._sweep(shape, chunk) for chunk in chunks]
         batch = point.shape[:-1]
-        f = torch.cat([part.f for part in parts]).reshape(batch)
-        gradient = torch.cat([part.gradient for part in parts]).reshape(*batch, 3)
-        fields = _joined([part.fields for part in parts]).each(lambda field: field.reshape(batch))
-        return _Samples(f, gradient, fields)
+        whole = parts[0] if len(parts) == 1 else _whole(parts)
+        fields = whole.fields.each(lambda field: field.reshape(batch))
+        return _Samples(whole.f.reshape(batch), whole.gradient.reshape(*batch, 3), fields)
 
     def _sweep(self, shape: Shape, point: Tensor) -> _Samples:
         fused = getattr(shape, "value_gradient_feature", None)
@@ -282,11 +281,8 @@ class StochasticSurface(nn.Module):
                     f"got {feature.shape[-1]}: it was made with another number of features"
                 )
             inputs = torch.cat([inputs, feature.to(point.dtype)], -1)
-        x = inputs
-        for i, layer in enumerate(self.layers):
-            x = torch.cat([x, inputs], -1) if i == SKIP else x
-            x = _squareplus(_linear(layer, x))
-        heads = linear(x, self.head_weight.to(x), self.head_bias.to(x)).unbind(-1)
+        weights = [*_weights(self.layers, inputs.shape[-1]), self.head_weight, self.head_bias]
+        heads = swept_heads(SKIP, inputs, *weights).unbind(-1)
         m, alpha = nn.functional.softplus(heads[0]), torch.sigmoid(heads[1])
         phi = 0.5 * math.pi * torch.tanh(heads[2])
         return Fields(m, alpha, phi, None if len(heads) < 4 else nn.functional.softplus(heads[3]))
@@ -303,15 +299,14 @@ def _layers() -> list[nn.Linear]:
     return layers
 
 
-def _linear(layer: nn.Module, x: Tensor) -> Tensor:
-    """A layer in the precision of its input; a missing h, which stands last, is left out."""
-    assert isinstance(layer, nn.Linear)
-    return linear(x, layer.weight.to(x)[:, : x.shape[-1]], layer.bias.to(x))
-
-
-def _squareplus(x: Tensor) -> Tensor:
-    """(x + sqrt(x^2 + 1)) / 2: smooth, positive, without transcendental functions."""
-    return 0.5 * (x + (x.square() + 1).sqrt())
+def _weights(layers: nn.ModuleList, inputs: int) -> Iterator[Tensor]:
+    """(weight, bias) of each layer in turn; what a missing h, which stands last, would have met is
+    left out."""
+    for i, layer in enumerate(layers):
+        assert isinstance(layer, nn.Linear)
+        seen = inputs + WIDTH * (i == SKIP) if i in (0, SKIP) else WIDTH
+        yield layer.weight if layer.in_features == seen else layer.weight[:, :seen]
+        yield layer.bias
 
 
 def _normalised(shape: Shape, point: Tensor) -> Tensor:
@@ -323,10 +318,15 @@ def _normalised(shape: Shape, point: Tensor) -> Tensor:
     return (point - middle) / torch.where(bounded, half, torch.ones_like(half))
 
 
-def _joined(parts: list[Fields]) -> Fields:
-    m, alpha, phi = (torch.cat([part[:3][i] for part in parts]) for i in range(3))
-    kappa = [part.kappa for part in parts if part.kappa is not None]
-    return Fields(m, alpha, phi, torch.cat(kappa) if kappa else None)
+def _whole(parts: list[_Samples]) -> _Samples:
+    fields = [part.fields for part in parts]
+    m, alpha, phi = (torch.cat([field[:3][i] for field in fields]) for i in range(3))
+    kappa = [field.kappa for field in fields if field.kappa is not None]
+    return _Samples(
+        torch.cat([part.f for part in parts]),
+        torch.cat([part.gradient for part in parts]),
+        Fields(m, alpha, phi, torch.cat(kappa) if kappa else None),
+    )
 
 
 def _pin(f: Tensor, crossing: Crossing) -> Tensor:

@@ -7,6 +7,7 @@ import torch
 
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.neural import CPU_CHUNK, NeuralShape, compute_lipschitz
+from rfsg.objects.shapes.sweeps import Question
 
 BOUNDS = [[-0.4, -0.7, 0.0], [0.6, 0.5, 1.1]]
 
@@ -84,6 +85,73 @@ def test_everything_can_be_differentiated_in_points_and_weights():
         return torch.func.functional_call(Ask(), state, (p,))
 
     assert torch.autograd.gradcheck(answers, (x, *weights), eps=1e-6, atol=1e-4, rtol=1e-4)
+
+
+ASKED = [(True, False, False), (False, False, True), (True, True, False), (True, True, True)]
+
+
+def asked_plainly(s, x, asked):
+    """The same question, its graph autograd's own: one node for every operation."""
+    own = (t.to(x.dtype) for t in (s._centre, s._reach, s._octaves))
+    question = Question(s.skip, s.softness, *own, *asked)
+    return s._plain(question, x, *s._parameters_in_turn())
+
+
+def asked_at_once(s, x, asked):
+    return s._answers(x, **dict(zip(("value", "gradient", "feature"), asked, strict=True)))
+
+
+@pytest.mark.parametrize("asked", ASKED)
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_derivatives_of_one_node_are_those_of_the_plain_sweep(asked, count):
+    """Of points and of every weight, whichever answers the loss depends on."""
+    s, x = shape(), points(count).requires_grad_()
+    inputs = [x, *s.parameters()]
+    fused, plain = asked_at_once(s, x, asked), asked_plainly(s, x, asked)
+    generator = torch.Generator().manual_seed(5)
+    pull = [torch.randn(a.shape, generator=generator, dtype=a.dtype) for a in plain]
+    subsets = [range(len(plain)), *([i] for i in range(len(plain)))]
+    for some in subsets:
+        found, expected = (
+            torch.autograd.grad(
+                [answers[i] for i in some],
+                inputs,
+                [pull[i] for i in some],
+                retain_graph=True,
+                materialize_grads=True,
+                allow_unused=True,
+            )
+            for answers in (fused, plain)
+        )
+        for a, b in zip(found, expected, strict=True):
+            tolerance = 1e-12 if b.dtype == torch.float64 else 1e-6
+            assert a.dtype == b.dtype
+            size = float(b.abs().max()) if b.numel() else 0.0
+            torch.testing.assert_close(a, b, rtol=tolerance, atol=tolerance * size)
+
+
+def test_second_derivatives_of_one_node_are_right():
+    """Points that depend on the weights too: what goes through them must not count twice."""
+    s = shape(width=4, depth=3, skip=1, frequencies=2, features=2).double()
+    weights = list(s.parameters())
+    found = []
+    for ask in (asked_at_once, asked_plainly):
+        x = points(3) + 0.1 * weights[0].sum()
+        value, gradient, feature = ask(s, x, (True, True, True))
+        total = (value**2).sum() + (gradient**3).sum() + (feature**2).sum()
+        first = torch.autograd.grad(total, weights, create_graph=True)
+        found.append(torch.autograd.grad(sum((g * g).sum() for g in first), weights))
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9 * float(b.abs().max()))
+
+
+def test_frozen_weights_and_points_are_left_alone():
+    s, x = shape(), points(5)
+    s.requires_grad_(False)
+    assert not any(a.requires_grad for a in s.value_gradient_feature(x))
+    s.to_value.requires_grad_(True)
+    s.value_and_gradient(x)[1].sum().backward()
+    assert s.hidden[0].weight.grad is None and s.to_value.weight.grad is not None
 
 
 def test_one_sweep_gives_the_same_as_three_questions():
