@@ -312,6 +312,7 @@ def report(result: Any, **facts: Any) -> dict[str, Any]:
         "status_meaning": {k: sentences[k] for k in result.status_counts if k in sentences},
         "search": result.search,
         "seconds": dict(result.seconds),
+        "peak_bytes": result.peak_bytes,
         "warnings": list(result.warnings),
         "versions": versions(),
     }

@@ -27,6 +27,17 @@ def test_the_door_is_light(statement):
     assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
 
 
+def test_an_answer_on_boxes_loads_no_more_than_it_needs():
+    """From the start of a process to the channel of a room: torch and Embree, and nothing else heavy."""
+    heavy = {"pxr", "trimesh", "matplotlib", "scipy", "sympy", "torch._dynamo", "torch._inductor"}
+    code = (
+        "import rfsg, sys; from tests.scenes import room; rfsg.simulate(room(), quality='draft');"
+        f"rfsg.radio_map(room(), cell=2.0, method='images'); print(*({heavy!r} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stdout.split(), done.stderr) == (0, [], "")
+
+
 @pytest.mark.parametrize("name", rfsg.__all__)
 def test_every_public_name_leads_somewhere(name):
     assert getattr(rfsg, name).__doc__

@@ -1,6 +1,8 @@
 """``rfsg map``: received power, path loss, SINR and best server over a plane or over an object."""
 
+from collections.abc import Callable
 from enum import StrEnum
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -22,17 +24,26 @@ from rfsg.cli.options import (
     Time,
     Variants,
 )
-from rfsg.cli.parse import parse_frequency, parse_numbers, parse_plane, parse_quality
+from rfsg.cli.parse import (
+    parse_decibel,
+    parse_duration,
+    parse_frequency,
+    parse_numbers,
+    parse_plane,
+    parse_quality,
+)
 from rfsg.cli.scenes import asked_of_scene, device_named, edit, read_scene
 from rfsg.cli.terminal import bar, note, print_files
 
 if TYPE_CHECKING:
     from rfsg.scene.scene import Scene
+    from rfsg.tracer import radiomap
 
 
 class Method(StrEnum):
     rays = "rays"
     paths = "paths"
+    images = "images"
 
 
 class Metric(StrEnum):
@@ -95,7 +106,24 @@ def map_(
         Method | None,
         typer.Option(
             help="rays: mean over each cell, fast. paths: exact at its middle, with every "
-            "mechanism. Default: rays on a plane, paths on an object."
+            "mechanism. images: as exact, and fast, for mirrors that are boxes and half-spaces. "
+            "Default: rays on a plane, paths on an object."
+        ),
+    ] = None,
+    budget: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_duration,
+            metavar="NUMBER[ms|s|min]",
+            help="By rays: refine the map until the time is up.",
+        ),
+    ] = None,
+    error: Annotated[
+        float | None,
+        typer.Option(
+            parser=parse_decibel,
+            metavar="NUMBER[dB]",
+            help="By rays: refine until the median standard error of the cells is below this.",
         ),
     ] = None,
     frequency: Frequency = None,
@@ -131,6 +159,7 @@ def map_(
     options: dict[str, Any] = {"quality": question, "seed": seed, "device": device_named(device)}
     options |= {} if cell is None else {"cell": cell}
     options |= {} if method is None else {"method": method.value}
+    options |= {"budget_s": budget, "error_db": error}
     where: dict[str, Any] = {} if height is None else {"height": height}
     where |= {} if plane is None else {"plane": parse_plane(plane)}
     if bounds is not None:
@@ -139,6 +168,7 @@ def map_(
 
     with bar() as progress:
         progress("radio map")
+        options["progress"] = _shown(progress, budget)
         if on is not None:
             found = radiomap.radio_map_on(edited, on, frequency, offset=offset, **options)
         else:
@@ -147,6 +177,8 @@ def map_(
     asked |= {"frequency_hz": found.frequency, "cells": list(found.cells.shape), "cell": cell}
     asked |= {"height": height, "plane": plane, "bounds": bounds, "on": on, "offset": offset}
     asked |= {"metric": metric.value, "bandwidth_hz": band, "noise_figure_db": noise_figure}
+    asked |= {"budget_s": budget, "asked_error_db": error}
+    asked |= {"current_error_db": found.current_error_db()}
     asked |= {"method": found.method, "seed": seed, "device": device, "quality": question}
     asked |= {"modelled": found.modelled, "left_out": found.left_out}
     asked |= {"warnings": found.warnings, "versions": report.versions()}
@@ -160,6 +192,19 @@ def map_(
     for warning in found.warnings:
         note(warning)
     print_files(out, ("map.npz", "map.png", "report.json"))
+
+
+def _shown(
+    progress: Callable[..., None], budget: float | None
+) -> "Callable[[radiomap.RadioMap], None]":
+    """Tells a progress bar how exact the map is so far; it fills as the budget is spent."""
+    begun = monotonic()
+
+    def tell(found: "radiomap.RadioMap") -> None:
+        done = 0.0 if budget is None else min(monotonic() - begun, budget)
+        progress("radio map", done, budget, f"{found.current_error_db():.2f} dB")
+
+    return tell
 
 
 def _transmitter(scene: "Scene", path: str) -> int:

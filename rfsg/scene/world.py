@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Contact, Crossing, Jet, Shape
 from rfsg.objects.shapes.analytic import Box, Boxes, HalfSpace
+from rfsg.objects.surfaces.interface import Known
 from rfsg.objects.surfaces.solid import PARALLEL, Backed, Solid, depth_behind, stretched
 from rfsg.scene.scene import Scene
 
@@ -86,7 +87,7 @@ class World:
         All boxes of a scene come as one ``Boxes``, a row for each of their positions.
         """
         owner = self.shape_of_node[which]
-        for k in torch.unique(owner).tolist():
+        for k in _present(owner):
             i = torch.nonzero(owner == k).squeeze(-1)
             shape = self.shapes[k]
             yield (Boxes(self.half_size[self.box_of_node[which[i]]]) if shape is None else shape), i
@@ -94,7 +95,7 @@ class World:
     def surface_groups(self, which: Int[Tensor, "m"]) -> Iterator[tuple[Body, Tensor]]:
         """(body, positions in the batch) for every surface; equal known materials are one."""
         owner = self.surface_of_node[which]
-        for k in torch.unique(owner).tolist():
+        for k in _present(owner):
             yield self.surfaces[k], torch.nonzero(owner == k).squeeze(-1)
 
     # frames
@@ -230,6 +231,17 @@ class World:
         place = (normal * self.translation[which]).sum(-1)
         return normal, offset * self.scale[which] + place, planar
 
+    @cached_property
+    def planar_patches(self) -> Int[Tensor, "n"]:
+        """How many planar patches each node has: they are numbered first."""
+        count = {id(n.body.shape): len(n.body.shape.planes()) for n in self.scene.nodes}
+        numbers = [count[id(n.body.shape)] for n in self.scene.nodes]
+        return torch.tensor(numbers, dtype=torch.int64, device=self.device)
+
+    def is_planar(self, which: Int[Tensor, "*b"], patch: Int[Tensor, "*b"]) -> Bool[Tensor, "*b"]:
+        """Whether patches of nodes are planar."""
+        return patch < self.planar_patches[which]
+
     # surfaces
 
     def reflection(
@@ -254,18 +266,27 @@ class World:
     def _contacts_object(
         self, which: Tensor, contact: Contact
     ) -> Iterator[tuple[Body, Tensor, Contact]]:
-        local = Contact(
+        """(body, positions in the batch, contacts in its frame) for every surface.
+
+        Known materials answer to angles alone, and those are the same in every frame.
+        """
+        for body, i in self.surface_groups(which):
+            alone = len(i) == len(which)  # then positions are in order
+            mine = contact if alone else Contact(*(getattr(contact, n)[i] for n in _CONTACT))
+            if isinstance(body.surface, Solid):
+                behind = self.behind(which[i], mine.point, mine.normal)
+                mine = Backed(mine.point, mine.incoming, mine.outgoing, mine.normal, behind)
+            elif not isinstance(body.surface, Known):
+                mine = self._contact_object(which[i], mine)
+            yield body, i, mine
+
+    def _contact_object(self, which: Int[Tensor, "m"], contact: Contact) -> Contact:
+        return Contact(
             self.point_object(which, contact.point),
             self.direction_object(which, contact.incoming),
             self.direction_object(which, contact.outgoing),
             self.direction_object(which, contact.normal),
         )
-        for body, i in self.surface_groups(which):
-            mine = Contact(local.point[i], local.incoming[i], local.outgoing[i], local.normal[i])
-            if isinstance(body.surface, Solid):
-                behind = self.behind(which[i], contact.point[i], contact.normal[i])
-                mine = Backed(mine.point, mine.incoming, mine.outgoing, mine.normal, behind)
-            yield body, i, mine
 
     def transmission(
         self,
@@ -323,7 +344,7 @@ class World:
         self, which: Int[Tensor, "m"], point_world: Float[Tensor, "m 3"]
     ) -> Bool[Tensor, "m"]:
         """Whether surface points lie on a plane face."""
-        return self.plane(which, self.patch(which, point_world))[2]
+        return self.is_planar(which, self.patch(which, point_world))
 
     def index(self, which: Int[Tensor, "m"], frequency: Float[Tensor, "f"]) -> Float[Tensor, "m f"]:
         """Index of refraction Re sqrt(eps_c) of solids."""
@@ -441,6 +462,7 @@ class World:
         return torch.where(bounded, scaled, depth)
 
 
+_CONTACT = tuple(Contact.__dataclass_fields__)
 FLUSH = 1e-8  # [m] faces this near to each other touch
 PROBE = 1e-6  # [m] before a face: what is there
 
@@ -451,6 +473,11 @@ def unit(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
     zero = square == 0
     inverse = torch.where(zero, torch.zeros_like(square), torch.where(zero, 1.0, square).rsqrt())
     return vector * inverse
+
+
+def _present(number: Int[Tensor, "m"]) -> list[int]:
+    """The numbers that occur, in order."""
+    return torch.nonzero(torch.bincount(number)).squeeze(-1).tolist()
 
 
 def _complex(which: Tensor, frequency: Tensor) -> Tensor:

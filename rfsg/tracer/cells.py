@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Scene, SceneError
+from rfsg.tracer.beams import Rows
 from rfsg.tracer.records import Rays
 
 MOST_CELLS = 4_000_000  # more are a mistyped cell size: refuse before taking memory
@@ -53,6 +54,13 @@ class Grid:
         """The cells' middles in the world [m], row by row."""
         y, x = torch.meshgrid(self.y, self.x, indexing="ij")
         return self.plane.point_world(torch.stack([x, y, torch.zeros_like(x)], -1).reshape(-1, 3))
+
+    @property
+    def rows(self) -> Rows:
+        """The middles as straight rows."""
+        first, second = self.plane.direction_world(torch.eye(3, dtype=torch.float64))[:2]
+        along = (self.x[:1, None] * first + self.y[:, None] * second) + self.plane.translation
+        return Rows(along, self.cell * first, len(self.x))
 
     @property
     def area(self) -> Float[Tensor, "c"]:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from rfsg.scene.world import FLUSH, World
 from rfsg.tracer.boxes import Layer, layers_of
+from rfsg.tracer.columns import at, columns, dot, minus
 from rfsg.tracer.records import Rays, Spans
 
 
@@ -94,10 +95,10 @@ FLAGS_A_PAIR = 64  # a table of more is slower than sorting the pairs
 
 
 @torch.no_grad()
-def brute_spans(world: World, rays: Rays) -> Spans:
-    """The plain twin: every ray against every node's box."""
-    everything = torch.arange(len(world), device=world.device)
-    ray, which = _product(rays.origin.shape[0], everything)
+def brute_spans(world: World, rays: Rays, nodes: Int[Tensor, "k"] | None = None) -> Spans:
+    """The plain twin: every ray against every node's box, or against those of ``nodes``."""
+    nodes = torch.arange(len(world), device=world.device) if nodes is None else nodes
+    ray, which = _product(rays.origin.shape[0], nodes)
     return _exact(world, rays, ray, which)
 
 
@@ -112,19 +113,22 @@ def _slab(world: World, rays: Rays, ray: Tensor, which: Tensor) -> tuple[Tensor,
     The boxes are a hair wider than their objects: a ray in a face, or in the rounding between two
     flush ones, has its span (see ``seams``).
     """
-    o = world.point_object(which, rays.origin[ray])
-    d = world.direction_object(which, rays.direction[ray])
-    skin = (0.5 * FLUSH / world.scale[which])[:, None]
-    low, high = world.bounds_object[which, 0] - skin, world.bounds_object[which, 1] + skin
-    parallel = d == 0
-    safe = torch.where(parallel, torch.ones_like(d), d)
-    a, b = (low - o) / safe, (high - o) / safe
-    within = (o >= low) & (o <= high)
-    inf = torch.full_like(a, torch.inf)
-    near = torch.where(parallel, torch.where(within, -inf, inf), torch.minimum(a, b))
-    far = torch.where(parallel, torch.where(within, inf, -inf), torch.maximum(a, b))
-    scale = world.scale[which]
-    return near.amax(-1) * scale, far.amin(-1) * scale
+    away = minus(at(columns(rays.origin), ray), at(columns(world.translation), which))
+    direction = at(columns(rays.direction), ray)
+    scale, skin = world.scale[which], 0.5 * FLUSH / world.scale
+    near, far = torch.full_like(scale, -torch.inf), torch.full_like(scale, torch.inf)
+    for axis in range(3):
+        turn = at(columns(world.rotation[:, :, axis]), which)
+        o, d = dot(turn, away) / scale, dot(turn, direction)
+        low = (world.bounds_object[:, 0, axis] - skin)[which]
+        high = (world.bounds_object[:, 1, axis] + skin)[which]
+        parallel = d == 0
+        safe = torch.where(parallel, 1.0, d)
+        a, b = (low - o) / safe, (high - o) / safe
+        always = torch.where((o >= low) & (o <= high), torch.inf, -torch.inf)
+        near = torch.maximum(near, torch.where(parallel, -always, torch.minimum(a, b)))
+        far = torch.minimum(far, torch.where(parallel, always, torch.maximum(a, b)))
+    return near * scale, far * scale
 
 
 def _exact(world: World, rays: Rays, ray: Tensor, which: Tensor) -> Spans:

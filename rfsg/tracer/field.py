@@ -13,21 +13,22 @@ alike; an average of the two amplitudes would cancel at grazing, where they diff
 """
 
 import torch
-from jaxtyping import Bool, Complex, Float, Int
+from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
 from rfsg.objects.physics.fresnel import SPEED_OF_LIGHT
-from rfsg.scene.antennas import basis
-from rfsg.scene.radios import Radio, amplitude, field_components
+from rfsg.scene.radios import Radio
 from rfsg.scene.world import World
-from rfsg.tracer.acting import Acting, crossing_normal, dyad_of, scalar
+from rfsg.tracer.acting import Acting, scalar
 from rfsg.tracer.edges import Edges
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.implicit import segments
-from rfsg.tracer.mechanisms import COEFFICIENT, DYAD
+from rfsg.tracer.jones import slots, transported
+from rfsg.tracer.mechanisms import COEFFICIENT
 from rfsg.tracer.passages import Passages, passages
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.records import Channel, Paths
+from rfsg.tracer.ports import Antennas
+from rfsg.tracer.records import Act, Channel, Paths
 from rfsg.tracer.refract import indices, inside
 
 
@@ -49,31 +50,60 @@ def channel(
     that is known; it is found otherwise. without: nodes whose coefficients are left out of unpolarised
     gains, for a caller who knows them by heart or is about to learn them.
     """
+    radios = transmitters, receivers
+    antennas = Antennas(transmitters, world.device), Antennas(receivers, world.device)
+
+    def one(some: Paths, through: Passages) -> Channel:
+        return _channel(world, some, radios, antennas, frequency, edges, through, without)
+
+    if through is not None:
+        return one(paths, through)
+    wavelength = float((SPEED_OF_LIGHT / frequency).min())
+    parts = []
+    for i in torch.arange(len(paths.tx), device=world.device).split(min(AT_ONCE, quality.chunk)):
+        some = paths.take(slice(int(i[0]), int(i[-1]) + 1)) if len(i) else paths
+        parts.append(one(some, passages(world, proxies, some, wavelength, quality)))
+    return Channel.joined(parts)
+
+
+AT_ONCE = 16_384  # paths: what they need stays near the cache
+
+
+def _channel(
+    world: World,
+    paths: Paths,
+    radios: tuple[tuple[Radio, ...], tuple[Radio, ...]],
+    antennas: tuple[Antennas, Antennas],
+    frequency: Float[Tensor, "f"],
+    edges: Edges | None,
+    through: Passages,
+    without: Bool[Tensor, "n"] | None,
+) -> Channel:
     wavelength = SPEED_OF_LIGHT / frequency
-    if through is None:
-        through = passages(world, proxies, paths, float(wavelength.min()), quality)
     _, u = segments(paths.vertices)
     departure, arrival = u[:, 0], -_last(u, paths)
     scale = wavelength[None] / (4 * torch.pi) * paths.spread[:, None]
-    way, refracted = inside(world, paths, frequency)
-    excess = _excess(world, paths, through, frequency) + refracted
+    excess = _excess(world, paths, through, frequency)
+    if _refracted(paths):
+        way, more = inside(world, paths, frequency)
+        excess, scale = excess + more, scale * way
     # T carries the phase of what was crossed; what moves into the delay leaves the gain. Every
     # caustic passed advances the phase by pi/2 (exp(+j 2 pi f t); Kouyoumjian and Pathak 1974, Eq. 6)
     phase = (
         2.0 * torch.pi * frequency[None] * excess[:, None]
         + 0.5 * torch.pi * paths.caustics[:, None].double()  # an integer's product is float32
     )
-    scale = scale * way * torch.polar(torch.ones_like(phase), phase)
+    scale = scale * torch.polar(torch.ones_like(phase), phase)
     at = Acting(world, paths, u, frequency, edges)
     jones = None
-    if _polarised(transmitters, receivers):
-        jones = _jones(at, through, transmitters, receivers) * scale[..., None, None]
-        gain = _between_ports(jones, paths, departure, arrival, transmitters, receivers)
+    (tx, rx), ends = antennas, ((paths.tx, departure), (paths.rx, arrival))
+    if any(r.polarization != "none" for r in (*tx.kinds, *rx.kinds)):
+        bases = tx.basis(*ends[0]), rx.basis(*ends[1])
+        jones = transported(at, through, *bases) * scale[..., None, None]
+        gain = _between_ports(jones, tx.components(*ends[0]), rx.components(*ends[1]))
     else:
-        antennas = _patterns(transmitters, paths.tx, departure) * _patterns(
-            receivers, paths.rx, arrival
-        )
-        gain = _scalar(at, through, without) * antennas[:, None] * scale
+        amplitude = tx.patterns(*ends[0]) * rx.patterns(*ends[1])
+        gain = _scalar(at, through, without) * amplitude[:, None] * scale
     blocked = torch.zeros(len(paths.tx), dtype=torch.bool, device=world.device)
     blocked[through.path[world.opaque[through.which]]] = True
     return Channel(
@@ -82,13 +112,18 @@ def channel(
         frequency,
         paths.length / SPEED_OF_LIGHT + excess,
         gain,
-        _doppler(world, paths, u, transmitters, receivers, frequency),
+        _doppler(world, paths, u, *radios, frequency),
         departure,
         arrival,
         through.crossed,
         blocked,
         jones,
     )
+
+
+def _refracted(paths: Paths) -> bool:
+    """Whether any path runs in a solid."""
+    return bool(((paths.act == int(Act.ENTER)) | (paths.act == int(Act.LEAVE))).any())
 
 
 def _last(u: Tensor, paths: Paths) -> Tensor:
@@ -123,103 +158,16 @@ def _transmission(at: Acting, through: Passages) -> Complex[Tensor, "m f 2"]:
     return at.world.transmission(through.which, through.crossing, at.frequency, through.last)
 
 
-def slots(path: Int[Tensor, "m"]) -> list[Tensor]:
-    """The k-th entries of every path, for k = 0, 1, ...: each list names a path at most once."""
-    order = torch.argsort(path, stable=True)
-    first = torch.ones(len(path), dtype=torch.bool, device=path.device)
-    first[1:] = path[order][1:] != path[order][:-1]
-    number = torch.arange(len(path), device=path.device)
-    rank = number - torch.cummax(torch.where(first, number, 0), 0).values
-    return [order[rank == k] for k in range(int(rank.max()) + 1)]
-
-
-# polarisation
-
-
-def _polarised(transmitters: tuple[Radio, ...], receivers: tuple[Radio, ...]) -> bool:
-    return any(r.polarization != "none" for r in (*transmitters, *receivers))
-
-
-def _jones(
-    at: Acting, through: Passages, transmitters: tuple[Radio, ...], receivers: tuple[Radio, ...]
-) -> Complex[Tensor, "p f 2 2"]:
-    """From (theta, phi) of the transmitter to (theta, phi) of the receiver, without spreading."""
-    paths, u = at.paths, at.u
-    sent = _basis(transmitters, paths.tx, u[:, 0])
-    field = sent.mT[:, None].to(torch.complex128).expand(-1, len(at.frequency), -1, -1)
-    transmission = _transmission(at, through) if len(through.path) else None
-    for level in range(paths.which.shape[1] + 1):
-        if transmission is not None:
-            here = torch.nonzero(through.segment == level).squeeze(-1)
-            if len(here):
-                for slot in slots(through.path[here]):
-                    field = _through(field, through, here[slot], u[:, level], transmission)
-        if level < paths.which.shape[1]:
-            for i, act in at.vertices(level):
-                field = field.index_copy(0, i, DYAD[act](at, i, level) @ field[i])
-    received = _basis(receivers, paths.rx, -_last(u, paths))
-    return received[:, None].to(field.dtype) @ field
-
-
-def _through(
-    field: Tensor, through: Passages, i: Tensor, u: Tensor, transmission: Tensor
-) -> Tensor:
-    path, crossing = through.path[i], through.crossing
-    n = crossing_normal(u[path], crossing.normal_start[i], crossing.normal_end[i])
-    bent = dyad_of(transmission[i], u[path], u[path], n) @ field[path]
-    return field.index_copy(0, path, bent)
-
-
-def _basis(
-    radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
-) -> Float[Tensor, "p 2 3"]:
-    """Rows theta-hat and phi-hat, in the world, of each path's radio along a direction."""
-    if not radios:
-        return direction.new_zeros(0, 2, 3)
-    rotation = torch.stack([r.rotation.to(direction) for r in radios])[index]
-    local = torch.einsum("pij,pi->pj", rotation, direction)
-    return basis(local) @ rotation.mT
-
-
 def _between_ports(
     jones: Complex[Tensor, "p f 2 2"],
-    paths: Paths,
-    departure: Float[Tensor, "p 3"],
-    arrival: Float[Tensor, "p 3"],
-    transmitters: tuple[Radio, ...],
-    receivers: tuple[Radio, ...],
+    sent: Complex[Tensor, "p 2"],
+    heard: Complex[Tensor, "p 2"],
 ) -> Complex[Tensor, "p f"]:
     """Gain between the reference ports, the first of each radio."""
-    sent = _components(transmitters, paths.tx, departure)
-    heard = _components(receivers, paths.rx, arrival)
-    return torch.einsum("pa,pfab,pb->pf", heard, jones, sent)
-
-
-def _components(
-    radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
-) -> Complex[Tensor, "p 2"]:
-    """(theta, phi) field of each path's radio, its first port, along a world direction."""
-    out = torch.zeros(len(index), 2, dtype=torch.complex128, device=direction.device)
-    for r in torch.unique(index).tolist():
-        i = torch.nonzero(index == r).squeeze(-1)
-        local = direction[i] @ radios[r].rotation.to(direction)
-        out = out.index_copy(0, i, field_components(radios[r], local)[:, 0])
-    return out
-
-
-def _patterns(
-    radios: tuple[Radio, ...], index: Int[Tensor, "p"], direction: Float[Tensor, "p 3"]
-) -> Float[Tensor, "p"]:
-    """Amplitude pattern sqrt(G) of each path's radio along a world direction."""
-    out = torch.ones(len(index), dtype=torch.float64, device=direction.device)
-    plain = {r for r, radio in enumerate(radios) if radio.pattern == "isotropic"}
-    if len(plain) == len(radios):
-        return out
-    for r in set(torch.unique(index).tolist()) - plain:
-        i = torch.nonzero(index == r).squeeze(-1)
-        local = direction[i] @ radios[r].rotation.to(direction)
-        out = out.index_copy(0, i, amplitude(radios[r], local))
-    return out
+    (tt, tp), (pt, pp) = (row.unbind(-1) for row in jones.unbind(2))
+    theta, phi = sent[:, None].unbind(-1)
+    heard_theta, heard_phi = heard[:, None].unbind(-1)
+    return heard_theta * (tt * theta + tp * phi) + heard_phi * (pt * theta + pp * phi)
 
 
 # delays
@@ -246,10 +194,14 @@ def _doppler(
 
     Each u times the index that its segment runs in: L is the optical length.
     """
-    u = u * indices(world, paths, frequency[:1])[..., None]
     zero = torch.zeros(0, 3, dtype=torch.float64, device=world.device)
     v_tx = torch.stack([r.velocity.to(zero) for r in transmitters]) if transmitters else zero
     v_rx = torch.stack([r.velocity.to(zero) for r in receivers]) if receivers else zero
+    velocities = (v_tx, v_rx, world.velocity)
+    if not any(v.requires_grad or bool(v.any()) for v in velocities):
+        return torch.zeros_like(paths.length)
+    if _refracted(paths):
+        u = u * indices(world, paths, frequency[:1])[..., None]
     growth = (_last(u, paths) * v_rx[paths.rx]).sum(-1) - (u[:, 0] * v_tx[paths.tx]).sum(-1)
     for level in range(paths.which.shape[1]):
         i = torch.nonzero(paths.which[:, level] >= 0).squeeze(-1)

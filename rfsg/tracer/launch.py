@@ -121,8 +121,7 @@ def _few_curved(world: World, chains: Chains, quality: Quality) -> Chains:
     """Chains with no more reflections on curved or learned faces than the quality follows."""
     if not len(world) or not chains.which.numel():
         return chains
-    which, patch = chains.which.clamp(min=0).reshape(-1), chains.patch.clamp(min=0).reshape(-1)
-    planar = world.plane(which, patch)[2].reshape(chains.which.shape)
+    planar = world.is_planar(chains.which.clamp(min=0), chains.patch.clamp(min=0))
     curved = (~planar & (chains.which >= 0)).sum(1)
     order = (chains.which >= 0).sum(1)
     few = (curved == 0) | ((curved <= quality.curved) & (order <= quality.curved_depth))
@@ -323,7 +322,7 @@ def _reflected_at_most(
 def _curvature(world: World, which: Tensor, point: Tensor) -> Tensor:
     """Largest curvature of the surface at hits [1/m], up to the size of the tube's own worth."""
     bend = torch.zeros(len(which), dtype=torch.float64, device=world.device)
-    flat = world.plane(which, world.patch(which, point))[2]
+    flat = world.is_flat(which, point)
     i = torch.nonzero(~flat).squeeze(-1)
     if len(i):
         hessian = world.jet(which[i], point[i], torch.float32).hessian

@@ -42,11 +42,13 @@ from rfsg.tracer.launch import (
 )
 from rfsg.tracer.march import crossings
 from rfsg.tracer.plan import Quality
+from rfsg.tracer.ports import Antennas
 from rfsg.tracer.records import Crossings, Rays
 from rfsg.tracer.scatter import rough_nodes
 from rfsg.tracer.simulate import positions, resolve_frequency, world_for
 
 COPIES = 8  # turned copies of the lattice; eight give the standard error to about a quarter
+MEETINGS = 1_000_000  # of rays and receivers looked at at a time
 
 
 @dataclass(frozen=True)
@@ -90,32 +92,35 @@ def flights(
     frequency: Float[Tensor, "1"],
     quality: Quality,
     branching: str,
-    seed: int,
-) -> Iterator[tuple[int, Flight]]:
-    """(copy, flight) for every turned copy of the lattice and every bounce level."""
+    generator: torch.Generator,
+) -> Iterator[Flight]:
+    """The flights of one turned copy of the lattice, bounce level by bounce level; a generator of
+    which the turn and all else that is random are drawn."""
     if branching not in ("enumerate", "draw"):
         raise ValueError(f"branching {branching!r}: expected 'enumerate' or 'draw'")
-    generator = torch.Generator().manual_seed(seed)
-    per_copy = max(1, quality.map_rays // COPIES)
-    lattice = fibonacci(per_copy, world.device)
-    for copy in range(COPIES):
-        direction = lattice @ _turn(generator).to(world.device)
-        pattern = amplitude(transmitter, direction @ transmitter.rotation.to(direction))
-        rays = Rays(
-            position.expand(per_copy, 3).clone(),
-            direction,
-            torch.full((per_copy,), torch.inf, dtype=torch.float64, device=world.device),
+    per_copy = per_round(quality)
+    direction = fibonacci(per_copy, world.device) @ _turn(generator).to(world.device)
+    pattern = amplitude(transmitter, direction @ transmitter.rotation.to(direction))
+    rays = Rays(
+        position.expand(per_copy, 3).clone(),
+        direction,
+        torch.full((per_copy,), torch.inf, dtype=torch.float64, device=world.device),
+    )
+    weight = pattern**2 / per_copy
+    fresh = torch.full_like(weight, quality.diffuse > 0, dtype=torch.bool)
+    for level in range(quality.depth + 1):
+        flight, reflected = _fly(
+            world, proxies, rays, weight, fresh, frequency, quality, branching, generator
         )
-        weight = pattern**2 / per_copy
-        fresh = torch.full_like(weight, quality.diffuse > 0, dtype=torch.bool)
-        for level in range(quality.depth + 1):
-            flight, reflected = _fly(
-                world, proxies, rays, weight, fresh, frequency, quality, branching, generator
-            )
-            yield copy, flight
-            if level == quality.depth or reflected is None:
-                break
-            rays, weight, fresh = reflected
+        yield flight
+        if level == quality.depth or reflected is None:
+            break
+        rays, weight, fresh = reflected
+
+
+def per_round(quality: Quality) -> int:
+    """Rays of one turned copy of the lattice."""
+    return max(1, quality.map_rays // COPIES)
 
 
 def _turn(generator: torch.Generator) -> Tensor:
@@ -267,19 +272,28 @@ def estimate_power(
     tx, rx = (positions(x, device) for x in (scene.transmitters, scene.receivers))
     per_copy = torch.zeros(COPIES, len(tx), len(rx), dtype=torch.float64, device=device)
     aperture = float((SPEED_OF_LIGHT / f) ** 2) / (4 * math.pi)
+    antennas = Antennas(scene.receivers, world.device)
     for t, radio in enumerate(scene.transmitters):
-        for copy, flight in flights(world, proxies, radio, tx[t], f, quality, branching, seed):
-            for j, receiver in enumerate(scene.receivers):
-                per_copy[copy, t, j] += _collected(flight, receiver, rx[j], radius)
+        generator = torch.Generator().manual_seed(seed)
+        for copy in per_copy:
+            for flight in flights(world, proxies, radio, tx[t], f, quality, branching, generator):
+                copy[t] += _collected(flight, antennas, rx, radius)
     per_copy *= aperture / (math.pi * radius**2)
     return per_copy.mean(0), per_copy.std(0) / COPIES**0.5
 
 
-def _collected(flight: Flight, receiver: Radio, position: Tensor, radius: float) -> Tensor:
-    away = position - flight.rays.origin
-    along = (away * flight.rays.direction).sum(-1)
-    across = (away - along[:, None] * flight.rays.direction).norm(dim=-1)
-    ray = torch.nonzero((across < radius) & (along > 0)).squeeze(-1)
-    arriving = -flight.rays.direction[ray] @ receiver.rotation.to(along)
-    pattern = amplitude(receiver, arriving) ** 2
-    return (flight.power_at(ray, along[ray]) * pattern).sum()
+def _collected(
+    flight: Flight, antennas: Antennas, position: Float[Tensor, "r 3"], radius: float
+) -> Float[Tensor, "r"]:
+    """What the spheres about the receivers collect of the rays that meet them."""
+    rays, power = flight.rays, torch.zeros_like(position[:, 0])
+    every = torch.arange(len(rays.limit), device=power.device)
+    for i in every.split(max(1, MEETINGS // max(1, len(position)))):
+        away = position[None] - rays.origin[i, None]
+        along = torch.einsum("irc,ic->ir", away, rays.direction[i])
+        square = torch.einsum("irc,irc->ir", away, away) - along * along
+        k, r = torch.nonzero((square < radius**2) & (along > 0), as_tuple=True)
+        weight = flight.power_at(i[k], along[k, r])
+        pattern = antennas.patterns(r, -rays.direction[i[k]])
+        power.index_add_(0, r, weight * pattern**2)
+    return power

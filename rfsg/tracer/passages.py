@@ -8,7 +8,8 @@ from torch import Tensor
 
 from rfsg.objects.contract import Crossing
 from rfsg.scene.world import FLUSH, World, unit
-from rfsg.tracer.embree import Proxies
+from rfsg.tracer.apart import traced
+from rfsg.tracer.embree import Proxies, brute_spans
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.march import EVALUATE, TOUCH, crossings
 from rfsg.tracer.plan import Quality
@@ -91,18 +92,33 @@ def every_crossing(
     """All crossings of rays, a chunk of rays at a time; only: of these nodes."""
     parts = []
     for i in torch.arange(len(rays.limit), device=world.device).split(quality.chunk):
-        some = Rays(rays.origin[i], rays.direction[i], rays.limit[i])
-        spans = proxies.spans(some)
-        if only is not None:
-            kept = only[spans.which]
-            spans = Spans(*(getattr(spans, n)[kept] for n in Spans.__dataclass_fields__))
-        found = crossings(world, some, spans, EVALUATE)
+        row, nodes = traced(world, rays.take(i))
+        nodes = nodes if only is None else nodes & only
+        i = i[row]
+        if not len(i) or not bool(nodes.any()):
+            continue
+        some = rays.take(i)
+        found = crossings(world, some, _spans(world, proxies, some, nodes), EVALUATE)
         parts.append([i[found.ray], *(getattr(found, n) for n in _BUT_RAY)])
     if not parts:
         none, zero = rays.limit.new_zeros(0, dtype=torch.int64), rays.limit.new_zeros(0)
         return Crossings(none, none, zero, zero, zero.reshape(0, 3), zero.reshape(0, 3))
     return Crossings(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
+
+def _spans(world: World, proxies: Proxies, rays: Rays, nodes: Bool[Tensor, "n"]) -> Spans:
+    """Spans of rays in some of the nodes; a few are asked one by one, without Embree."""
+    some = torch.nonzero(nodes).squeeze(-1)
+    if len(some) <= ONE_BY_ONE:
+        return brute_spans(world, rays, some)
+    spans = proxies.spans(rays)
+    if len(some) == len(world):
+        return spans
+    kept = nodes[spans.which]
+    return Spans(*(getattr(spans, n)[kept] for n in Spans.__dataclass_fields__))
+
+
+ONE_BY_ONE = 4
 
 _BUT_RAY = tuple(Crossings.__dataclass_fields__)[1:]
 
@@ -147,6 +163,8 @@ def _medium(
     world: World, paths: Paths, path: Tensor, segment: Tensor, inside: Crossings
 ) -> Bool[Tensor, "m"]:
     """Crossings of the medium that a refracted segment runs in."""
+    if not bool(world.solid.any()):
+        return torch.zeros_like(inside.ray, dtype=torch.bool)
     solid = runs_in(paths.which, paths.act)[path, segment][inside.ray]
     same = world.medium[solid.clamp(min=0)] == world.medium[inside.which]
     return (solid >= 0) & same

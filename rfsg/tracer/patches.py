@@ -13,6 +13,7 @@ from rfsg.objects.shapes.analytic import Box
 from rfsg.objects.shapes.mesh import Mesh
 from rfsg.scene.scene import SceneError
 from rfsg.scene.world import World, unit
+from rfsg.tracer.beams import Rows
 from rfsg.tracer.cells import GRAZING, MOST_CELLS, Meeting
 from rfsg.tracer.records import Rays
 
@@ -44,6 +45,11 @@ class Patches:
     def subarea(self) -> Float[Tensor, "k"]:
         """Areas of the triangles [m^2]."""
         return 0.5 * _cross(self.triangle).norm(dim=-1)
+
+    @property
+    def rows(self) -> Rows:
+        """The places, each a row of its own."""
+        return Rows(self.point, torch.zeros_like(self.point[:1]).sum(0), 1)
 
     @property
     def area(self) -> Float[Tensor, "c"]:

@@ -2,14 +2,20 @@
 
 ``rays``: the Monte Carlo estimator of ``montecarlo``, every branch followed: what crosses a cell,
 over its area. It follows reflection, mirror-like and diffuse, and penetration. ``paths``: the exact
-path solver at a point of each cell, with all that the quality asks for. The rays' map is the mean
-over a cell, the solver's a point of it, so the reported error holds both the scatter between turned
-lattices and the spread of power within the cell.
+path solver at a point of each cell, with all that the quality asks for. ``images``: the same mirrors
+and penetration, as exactly, for scenes of boxes and half-spaces, many times faster. The rays' map is
+the mean over a cell, the others' a point of it, so the rays' reported error holds both the scatter
+between turned lattices and the spread of power within the cell.
+
+A map by rays refines while one watches: it is a mean over rounds, each a turned lattice, and may stop
+when its time is up or its error small enough.
 
 Power is summed over paths without phase, as it is where phases average out over a cell.
 """
 
 import math
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,13 +30,17 @@ from rfsg.scene.world import World
 from rfsg.tracer.cells import Grid, extent, grid_on
 from rfsg.tracer.channel import power, thermal_noise_dbm
 from rfsg.tracer.embree import Proxies
-from rfsg.tracer.field import SPEED_OF_LIGHT
-from rfsg.tracer.montecarlo import COPIES, flights
+from rfsg.tracer.imagemap import power_by_images
+from rfsg.tracer.montecarlo import COPIES, per_round
 from rfsg.tracer.patches import Patches, patches_from, patches_of
 from rfsg.tracer.plan import Quality, make_plan
+from rfsg.tracer.rounds import Rounds, median_db
 from rfsg.tracer.simulate import positions, resolve_frequency, simulate, world_for
 
 RECEIVERS_AT_ONCE = 4096  # of a map by paths: memory stays bounded, and the answer the same
+LEAST_ROUNDS = 2  # fewer have no scatter, so no error
+MOST_ROUNDS = 4096  # an error that so many do not reach is out of reach
+METHODS = ("rays", "paths", "images")
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,9 @@ class RadioMap:
     """Power over cells, by transmitter in scene order; ``*c`` is [ny nx] on a plane, [c] on a surface.
 
     path_gain: linear, from the transmitter's antenna to an isotropic one, 0 where nothing arrives.
-    error_db: one standard deviation [dB], inf where nothing arrives, 0 for the path solver.
+    error_db: one standard deviation [dB], inf where nothing arrives, 0 for paths and images.
+    scatter_db: for rays the part of it that more rays bring down, the standard error of the cells'
+    means; None for the others, which have none.
     """
 
     scene: Scene
@@ -50,6 +62,11 @@ class RadioMap:
     modelled: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
+    scatter_db: Float[Tensor, "t *c"] | None = None
+
+    def current_error_db(self) -> float:
+        """Median standard error over the cells that hear something [dB]; 0 where nothing scatters."""
+        return 0.0 if self.scatter_db is None else median_db([self.scatter_db])
 
     def path_loss_db(self) -> Float[Tensor, "t *c"]:
         """-10 log10 of the path gain, the transmitter's pattern included; inf where nothing arrives."""
@@ -112,15 +129,27 @@ def radio_map(
     method: str = "rays",
     seed: int = 0,
     device: torch.device | str = "cpu",
+    budget_s: float | None = None,
+    error_db: float | None = None,
+    progress: Callable[[RadioMap], None] | None = None,
 ) -> RadioMap:
     """Path gain of every transmitter over square cells of side ``cell`` [m] on a plane.
 
     plane: a pose whose x and y axes span it (``cells.plane_through``); None is level, at ``height``
     [m]. bounds: (x0, y0, x1, y1) [m] in the plane's frame, for a level one the world's; None takes
-    the extent of objects and radios. Raises SceneError for a map of no or of too many cells, and for
-    an unknown method.
+    the extent of objects and radios.
+
+    method: "rays", "paths" or "images". Of rays: budget_s [s] stops after the last round that fits;
+    error_db [dB] stops when the median standard error over the cells that hear something is below
+    it (``RadioMap.current_error_db``), after 8 rounds at least; without either 8 rounds share the
+    quality's ``map_rays``. progress: called with the map so far after every round. A rule that looks
+    at the error stops a little too early in the mean: the bias is of the order of the error squared.
+
+    Raises SceneError for a map of no or of too many cells, for an unknown method, a budget for an
+    exact method, and for scenes of more than boxes and half-spaces by images.
     """
-    question = _question(scene, frequency, quality, method, seed, device)
+    until = _Until(budget_s, error_db, progress)
+    question = _question(scene, frequency, quality, method, seed, device, until)
     plane = Pose.at(0.0, 0.0, height) if plane is None else plane
     bounds = bounds or extent(scene, _corners(question.world), plane)
     return question.answer(grid_on(plane, bounds, cell))
@@ -138,6 +167,9 @@ def radio_map_on(
     method: str = "paths",
     seed: int = 0,
     device: torch.device | str = "cpu",
+    budget_s: float | None = None,
+    error_db: float | None = None,
+    progress: Callable[[RadioMap], None] | None = None,
 ) -> RadioMap:
     """Path gain over the outside of a surface, in triangles no longer than ``cell`` [m].
 
@@ -146,10 +178,48 @@ def radio_map_on(
     mounted there would; what the surface itself reflects is part of it. Raises SceneError for an
     object that is not there or has no bounded surface, and for a mesh that is not one.
     """
-    question = _question(scene, frequency, quality, method, seed, device)
+    until = _Until(budget_s, error_db, progress)
+    question = _question(scene, frequency, quality, method, seed, device, until)
     if isinstance(where, str):
         return question.answer(patches_of(question.world, where, cell, offset))
     return question.answer(patches_from(*where, cell, offset))
+
+
+@dataclass(frozen=True)
+class _Until:
+    """When to stop, and whom to tell meanwhile."""
+
+    budget_s: float | None
+    error_db: float | None
+    progress: Callable[[RadioMap], None] | None
+
+    def check(self, method: str) -> None:
+        for name, value in (("budget_s", self.budget_s), ("error_db", self.error_db)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise SceneError([f"map: {name} is {value!r}; expected a finite number above 0"])
+        if self.budget_s is not None and method != "rays":
+            raise SceneError(
+                [f"map: budget_s goes with method 'rays', which refines; {method!r} is exact"]
+            )
+
+    def enough(self, rounds: Rounds, left_s: float, longest_s: float) -> bool:
+        """Whether to stop, with so much time left, after rounds that took as long as ``longest_s``."""
+        if left_s < longest_s or rounds.count >= MOST_ROUNDS:
+            return True
+        if rounds.count < COPIES:  # fewer say too little of how they scatter
+            return False
+        if self.error_db is None:
+            return self.budget_s is None
+        return rounds.error_db() <= self.error_db
+
+    def short_of(self, rounds: Rounds) -> tuple[str, ...]:
+        """A sentence if the error asked for is not reached."""
+        if self.error_db is None or rounds.error_db() <= self.error_db:
+            return ()
+        return (
+            f"map: after {rounds.count} rounds the median standard error is {rounds.error_db():.3g} "
+            f"dB, not the {self.error_db:g} dB asked for",
+        )
 
 
 @dataclass(frozen=True)
@@ -161,10 +231,15 @@ class _Question:
     quality: Quality
     method: str
     seed: int
+    until: _Until
 
     def answer(self, cells: Grid | Patches) -> RadioMap:
-        make = _by_rays if self.method == "rays" else _by_paths
-        return make(self, cells)
+        if self.method == "rays":
+            return _by_rays(self, cells)
+        found = _by_paths(self, cells) if self.method == "paths" else _by_images(self, cells)
+        if self.until.progress is not None:
+            self.until.progress(found)
+        return found
 
 
 def _question(
@@ -174,12 +249,15 @@ def _question(
     method: str,
     seed: int,
     device: torch.device | str,
+    until: _Until,
 ) -> _Question:
-    if method not in ("rays", "paths"):
-        raise SceneError([f"map method {method!r}: expected 'rays' or 'paths'"])
+    if method not in METHODS:
+        raise SceneError([f"map method {method!r}: expected one of {', '.join(METHODS)}"])
+    until.check(method)
     quality = Quality.named(quality) if isinstance(quality, str) else quality
     f = resolve_frequency(scene, frequency)[:1].to(device)
-    return _Question(world_for(scene, quality, device), f, quality, method, seed)
+    world = world_for(scene, quality, device)
+    return _Question(world, f, quality, method, seed, until)
 
 
 def _corners(world: World) -> Float[Tensor, "k 3"]:
@@ -216,33 +294,70 @@ def _by_paths(question: _Question, cells: Grid | Patches) -> RadioMap:
     )
 
 
-def _by_rays(question: _Question, cells: Grid | Patches) -> RadioMap:
-    world, quality, f = question.world, question.quality, question.frequency
-    scene, proxies = world.scene, Proxies(world)
+def _by_images(question: _Question, cells: Grid | Patches) -> RadioMap:
+    world, quality = question.world, question.quality
+    scene = world.scene
     tx = positions(scene.transmitters, world.device)
-    owner, area = cells.owner.to(world.device), cells.subarea.to(world.device)
-    aperture = float((SPEED_OF_LIGHT / f) ** 2) / (4 * math.pi)
-    gain = torch.zeros(len(tx), math.prod(cells.shape), dtype=torch.float64, device=f.device)
-    error = torch.full_like(gain, torch.inf)
-    for t, radio in enumerate(scene.transmitters):
-        total = torch.zeros(COPIES, len(area), dtype=torch.float64, device=world.device)
-        for copy, flight in flights(
-            world, proxies, radio, tx[t], f, quality, "enumerate", question.seed
-        ):
-            met = cells.meet(flight.rays)
-            share = flight.power_at(met.ray, met.distance) / met.cosine
-            total[copy].index_add_(0, met.subcell, share)
-        gain[t], error[t] = _summary(total * aperture / area, area, owner, gain.shape[1])
+    gain = power_by_images(
+        world,
+        scene.transmitters,
+        tx,
+        cells.rows.to(world.device),
+        cells.point.to(world.device),
+        question.frequency,
+        quality,
+    )
+    plan = make_plan(world, quality)
+    gain = gain.reshape(-1, *cells.shape)
+    round_edges = ("edge diffraction: a map by images knows mirrors alone",)
     return RadioMap(
         scene,
-        float(f[0]),
+        float(question.frequency[0]),
         cells,
-        gain.reshape(-1, *cells.shape),
-        error.reshape(-1, *cells.shape),
-        "rays",
-        _by_rays_in_words(quality),
-        (*make_plan(world, quality).left_out, _NOT_BY_RAYS),
+        gain,
+        torch.zeros_like(gain),
+        "images",
+        plan.modelled,
+        (*plan.left_out, *round_edges[: quality.diffraction]),
         scene.warnings,
+    )
+
+
+def _by_rays(question: _Question, cells: Grid | Patches) -> RadioMap:
+    """Rounds of turned lattices until the budget is spent or the error small enough."""
+    rounds = Rounds(question.world, question.frequency, question.quality, question.seed, cells)
+    until, begun, longest = question.until, time.monotonic(), 0.0
+    while True:
+        before = time.monotonic()
+        rounds.add()
+        now = time.monotonic()
+        longest = max(longest, now - before)
+        if rounds.count < LEAST_ROUNDS:
+            continue
+        left = math.inf if until.budget_s is None else begun + until.budget_s - now
+        done = until.enough(rounds, left, longest)
+        if until.progress is not None or done:
+            found = _map_of(question, cells, rounds)
+            if until.progress is not None:
+                until.progress(found)
+            if done:
+                return found
+
+
+def _map_of(question: _Question, cells: Grid | Patches, rounds: Rounds) -> RadioMap:
+    scene, quality = question.world.scene, question.quality
+    gain, error, scatter = (x.reshape(-1, *cells.shape) for x in rounds.summary())
+    return RadioMap(
+        scene,
+        float(question.frequency[0]),
+        cells,
+        gain,
+        error,
+        "rays",
+        _by_rays_in_words(quality, rounds.count),
+        (*make_plan(question.world, quality).left_out, _NOT_BY_RAYS),
+        (*scene.warnings, *question.until.short_of(rounds)),
+        scatter,
     )
 
 
@@ -252,30 +367,9 @@ _NOT_BY_RAYS = (
 )
 
 
-def _by_rays_in_words(quality: Quality) -> tuple[str, ...]:
+def _by_rays_in_words(quality: Quality, rounds: int) -> tuple[str, ...]:
     scattered = ", diffuse once" if quality.diffuse else ""
     return (
-        f"{quality.map_rays} rays from each transmitter with {quality.depth} reflections at most"
-        f"{scattered}, and what they go through",
+        f"{rounds * per_round(quality)} rays from each transmitter, in {rounds} turned lattices, with "
+        f"{quality.depth} reflections at most{scattered}, and what they go through",
     )
-
-
-def _summary(
-    density: Float[Tensor, "n s"], area: Float[Tensor, "s"], owner: Int[Tensor, "s"], count: int
-) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
-    """Mean gain of cells, and one standard deviation in dB of scatter and spread together."""
-    zero = torch.zeros(count, dtype=area.dtype, device=area.device)
-    share = area / zero.index_add(0, owner, area)[owner]
-
-    def over_cells(value: Float[Tensor, "s"]) -> Float[Tensor, "c"]:
-        return zero.index_add(0, owner, share * value)
-
-    mean = over_cells(density.mean(0))
-    scatter = torch.stack([over_cells(copy) for copy in density]).std(0) / COPIES**0.5
-    # the spread between sub-cells, less what their own scatter already explains
-    noise = density.var(0) / COPIES
-    spread = over_cells((density.mean(0) - mean[owner]) ** 2 - noise).clamp(min=0.0)
-    deviation = torch.sqrt(scatter**2 + spread)
-    safe = torch.where(mean > 0, mean, torch.ones_like(mean))
-    error = 10.0 * torch.log10(1.0 + deviation / safe)
-    return mean, torch.where(mean > 0, error, torch.full_like(error, torch.inf))

@@ -77,6 +77,10 @@ class Rays:
     direction: Float[Tensor, "r 3"]
     limit: Float[Tensor, "r"]  # [m], inf for none
 
+    def take(self, i: Int[Tensor, "m"]) -> "Rays":
+        """Some of the rays."""
+        return Rays(self.origin[i], self.direction[i], self.limit[i])
+
 
 @dataclass(frozen=True)
 class Spans:
@@ -136,7 +140,7 @@ class Paths:
     caustics: Int[Tensor, "p"]
     status: Int[Tensor, "p"]
 
-    def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "p"]) -> "Paths":
+    def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "p"] | slice) -> "Paths":
         """Some of the paths."""
         return Paths(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
 
@@ -219,3 +223,18 @@ class Channel:
     crossed: Int[Tensor, "x 3"]
     blocked: Bool[Tensor, "p"]
     jones: Complex[Tensor, "p f 2 2"] | None = None
+
+    @staticmethod
+    def joined(parts: "Sequence[Channel]") -> "Channel":
+        """The channel of all paths of several channels at the same frequencies, in order."""
+        if len(parts) == 1:
+            return parts[0]
+        first, before, crossed = parts[0], 0, []
+        for part in parts:
+            crossed.append(part.crossed + part.crossed.new_tensor([before, 0, 0]))
+            before += len(part.tx)
+        same = {"frequency": first.frequency, "crossed": torch.cat(crossed), "jones": None}
+        if first.jones is not None:
+            same["jones"] = torch.cat([p.jones for p in parts if p.jones is not None])
+        rest = [n for n in Channel.__dataclass_fields__ if n not in same]
+        return Channel(**{n: torch.cat([getattr(p, n) for p in parts]) for n in rest}, **same)

@@ -88,8 +88,9 @@ def coincident(
     place = torch.round(vertices[i].flatten(1) / SAME).to(torch.int64)
     turn = torch.round(normal[i].flatten(1) / TURNED).to(torch.int64)
     key = torch.cat([chains.tx[i, None], chains.rx[i, None], place, turn], 1)
-    # one number for a row: integers wrap around, and two rows share one by a chance of 1 in 1e19
-    odd = (2 * torch.arange(key.shape[1], device=i.device) + 1) * 0x1E3779B97F4A7C15
+    # one number for a row: integers wrap around, and two rows share one by a chance of 1 in 1e19. A
+    # power for each column: multiples of one number would leave small sums of them that meet often
+    odd = torch.cumprod(torch.full((key.shape[1],), 0x1E3779B97F4A7C15, device=i.device), 0)
     _, group, count = torch.unique((key * odd).sum(1), return_inverse=True, return_counts=True)
     several = count[group] > 1
     i, group = i[several], group[several]

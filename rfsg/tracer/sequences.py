@@ -18,6 +18,7 @@ from torch import Tensor
 from rfsg.scene.world import World, unit
 from rfsg.tracer.faces import Planes, Samples, planes_of, samples_of
 from rfsg.tracer.plan import Quality
+from rfsg.tracer.reached import reached
 from rfsg.tracer.records import Chains
 
 MOST_PAIRS = 300_000_000  # beam tests and image solves an enumeration may take: a minute or two
@@ -157,34 +158,12 @@ def _planar_chains(
     quality: Quality,
     budget: Budget,
 ) -> Chains:
-    """Prefixes whose last face mirrors the image onto a receiver through its rectangle."""
-    p, r = len(prefixes.image), len(rx_position)
-    budget.spend(p * r)
-    none = torch.zeros(0, dtype=torch.int64, device=rx_position.device)
-    rows, columns = [none], [none]
-    block = max(1, 1_000_000 // max(r, 1))
-    for begin in range(0, p, block):
-        some = prefixes.take(torch.arange(begin, min(p, begin + block), device=rx_position.device))
-        row, column = torch.nonzero(_through_last(planes, some, rx_position), as_tuple=True)
-        rows.append(row + begin)
-        columns.append(column)
-    row, rx = torch.cat(rows), torch.cat(columns)
+    """Prefixes that mirror the transmitter onto a receiver, through the rectangles of all faces."""
+    budget.spend(len(prefixes.image) * len(rx_position))
+    row, rx = reached(planes, prefixes.image, prefixes.faces, rx_position)
     face = prefixes.faces[row]
     seed = torch.zeros(*face.shape, 3, dtype=torch.float64, device=face.device)
     return _chains(planes, t, rx, face, seed, quality.depth)
-
-
-def _through_last(planes: Planes, prefixes: Prefixes, point: Tensor) -> Bool[Tensor, "p n"]:
-    """Does the line from an image to a point pass the last face, from behind to the front?"""
-    last = prefixes.faces[:, -1]
-    normal, offset = planes.normal[last], planes.offset[last]
-    near = (prefixes.image * normal).sum(-1) - offset
-    far = point @ normal.T - offset
-    t = near[:, None] / (near[:, None] - far.T).clamp(max=-1e-300)
-    hit = prefixes.image[:, None] + t[..., None] * (point[None] - prefixes.image[:, None])
-    uv = torch.einsum("pnj,pij->pni", hit - planes.centre[last][:, None], planes.edges[last])
-    half = planes.half[last][:, None] * (1 + EDGE) + 1e-9
-    return (far.T > 0) & (near < 0)[:, None] & (uv.abs() <= half).all(-1)
 
 
 def _reaching(planes: Planes, prefixes: Prefixes, item: Samples) -> Prefixes:

@@ -21,6 +21,7 @@ from rfsg.tracer.edges import edges_in
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.launch import SearchReport, search
+from rfsg.tracer.memory import peak_bytes
 from rfsg.tracer.plan import Plan, Quality, make_plan
 from rfsg.tracer.records import Chains, Channel, Paths, Status
 from rfsg.tracer.response import (
@@ -37,7 +38,10 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Result:
-    """Everything about one simulation. ``paths`` and ``channel`` share their path axis."""
+    """Everything about one simulation. ``paths`` and ``channel`` share their path axis.
+
+    peak_bytes: the most memory in use when it ended (``memory.peak_bytes``).
+    """
 
     scene: Scene
     frequency: Float[Tensor, "f"]
@@ -49,6 +53,7 @@ class Result:
     status_counts: dict[str, int]
     seconds: dict[str, float]
     warnings: tuple[str, ...] = field(default=())
+    peak_bytes: int | None = None
 
     def transfer(self) -> Complex[Tensor, "t r f"]:
         """h(f) of every transmitter and receiver, antennas included, 1 W in."""
@@ -146,7 +151,17 @@ def simulate(
     named = {s.name: n for s, n in sorted(counts.items())}
     warnings = (*scene.warnings, *validity.sentences(world, frequencies))
     return Result(
-        scene, frequencies, paths, channel, chains, plan, report, named, seconds, warnings
+        scene,
+        frequencies,
+        paths,
+        channel,
+        chains,
+        plan,
+        report,
+        named,
+        seconds,
+        warnings,
+        peak_bytes(device),
     )
 
 
@@ -186,12 +201,14 @@ def resolve_frequency(scene: Scene, frequency: float | Tensor | None) -> Float[T
 
 def positions(radios: tuple[Radio, ...], device: torch.device | str) -> Float[Tensor, "n 3"]:
     """Radio positions stacked [m]; SceneError for one that is not finite."""
-    bad = [r.path for r in radios if not bool(torch.isfinite(r.position).all())]
-    if bad:
-        raise SceneError([f"{path}: position is not finite" for path in bad])
     if not radios:
         return torch.zeros(0, 3, dtype=torch.float64, device=device)
-    return torch.stack([r.position.to(device=device, dtype=torch.float64) for r in radios])
+    position = torch.stack([r.position.to(device=device, dtype=torch.float64) for r in radios])
+    finite = torch.isfinite(position).all(-1).tolist()
+    bad = [r.path for r, good in zip(radios, finite, strict=True) if not good]
+    if bad:
+        raise SceneError([f"{path}: position is not finite" for path in bad])
+    return position
 
 
 def _above_floor(

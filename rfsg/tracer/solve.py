@@ -10,6 +10,7 @@ function theorem), so paths are differentiable in poses, shapes, radios and netw
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from rfsg.scene.world import World, unit
 from rfsg.tracer import zone
-from rfsg.tracer.images import images_of, unfolded
+from rfsg.tracer.columns import dot, minus
 from rfsg.tracer.implicit import (
     caustics,
     kkt,
@@ -28,6 +29,7 @@ from rfsg.tracer.implicit import (
     transverse,
 )
 from rfsg.tracer.march import FORWARD
+from rfsg.tracer.mirrored import Folded, Mirrors, folded, mirrors_of, stacked, within_sides
 from rfsg.tracer.newton import Batch, Surfaces, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains, Paths, Status
@@ -68,6 +70,7 @@ def solve(
     """
     depth_of = (chains.which >= 0).sum(1)
     most = chains.which.shape[1]
+    mirrors = mirrors_of(world)
     parts: list[tuple[Tensor, Solved]] = []
     for depth in torch.unique(depth_of).tolist():
         for i in torch.nonzero(depth_of == depth).squeeze(-1).split(quality.chunk):
@@ -79,18 +82,20 @@ def solve(
                 chains.patch[i, :depth],
                 chains.seed[i, :depth],
             )
-            parts.append((i, _pad(_one_way(world, batch, wavelength, quality), most)))
+            parts.append((i, _pad(_one_way(world, mirrors, batch, wavelength, quality), most)))
     return _gather(world, chains, parts, most, wavelength, keep_failed)
 
 
-def _one_way(world: World, batch: Batch, wavelength: float, quality: Quality) -> Solved:
+def _one_way(
+    world: World, mirrors: Mirrors, batch: Batch, wavelength: float, quality: Quality
+) -> Solved:
     """Solve every chain from the same end, whichever end transmits: the same bits both ways.
 
     Over a rough learned face Newton may find one of several glints; swapping transmitter and receiver
     must not change which.
     """
     back = (batch.rx - batch.tx) @ batch.tx.new_tensor(FORWARD) < 0
-    solved = _solve_depth(world, batch.turned(back), wavelength, quality)
+    solved = _solve_depth(world, mirrors, batch.turned(back), wavelength, quality)
     return replace(
         solved,
         vertices=torch.where(back[:, None, None], solved.vertices.flip(1), solved.vertices),
@@ -98,20 +103,20 @@ def _one_way(world: World, batch: Batch, wavelength: float, quality: Quality) ->
     )
 
 
-def _solve_depth(world: World, batch: Batch, wavelength: float, quality: Quality) -> Solved:
+def _solve_depth(
+    world: World, mirrors: Mirrors, batch: Batch, wavelength: float, quality: Quality
+) -> Solved:
     c, depth = batch.which.shape
     if depth == 0:
         return _direct(batch)
-    flat_which, flat_patch = batch.which.reshape(-1), batch.patch.reshape(-1)
-    planar = world.plane(flat_which, flat_patch)[2].reshape(c, depth)
-    mirrors = planar.all(1)
-    if bool(mirrors.all()):
-        return _images(world, batch)
-    curved = ~mirrors
+    planar = world.is_planar(batch.which, batch.patch).all(1)
+    if bool(planar.all()):
+        return _images(world, mirrors, batch)
+    curved = ~planar
     return _merge(
         c,
         [
-            (torch.nonzero(mirrors).squeeze(-1), lambda b: _images(world, b)),
+            (torch.nonzero(planar).squeeze(-1), lambda b: _images(world, mirrors, b)),
             (
                 torch.nonzero(curved).squeeze(-1),
                 lambda b: _stationary(world, b, wavelength, quality),
@@ -145,18 +150,46 @@ def _direct(batch: Batch) -> Solved:
 # planar mirrors: the image method
 
 
-def _images(world: World, batch: Batch) -> Solved:
-    mirrors = [(batch.which[:, i], batch.patch[:, i]) for i in range(batch.which.shape[1])]
-    images = images_of(world, mirrors, batch.tx)
-    x = unfolded(images, batch.rx)
-    line = batch.rx - images.image
-    square = (line * line).sum(-1)
-    length = torch.sqrt(torch.where(square == 0, torch.ones_like(square), square))
-    batch.x = x
-    status = _validate(world, batch, batch.polyline(x), images.normal, None)
-    status = torch.where(square == 0, int(Status.DEGENERATE), status)
-    none = torch.zeros_like(status)
-    return Solved(batch.polyline(x), images.normal, 1.0 / length, none, status)
+def _images(world: World, mirrors: Mirrors, batch: Batch) -> Solved:
+    path = folded(mirrors, batch.which, batch.patch, batch.tx, batch.rx)
+    vertices, normal = stacked(path.vertices), stacked(path.normals)
+    status = _mirror_status(world, batch, path, vertices, normal)
+    apart = path.length > 0
+    status = torch.where(apart, status, int(Status.DEGENERATE))
+    spread = 1.0 / torch.where(apart, path.length, 1.0)
+    return Solved(vertices, normal, spread, torch.zeros_like(status), status)
+
+
+@torch.no_grad()
+def _mirror_status(
+    world: World, batch: Batch, path: Folded, vertices: Tensor, normal: Tensor
+) -> Int[Tensor, "c"]:
+    """``_validate`` of chains of planar mirrors, where rectangular faces need only look at their
+    sides."""
+    rectangular = world.rectangular[batch.which].all(1)
+    on = torch.ones_like(rectangular)
+    limit = tolerance(world, batch, 0.0)
+    for level, point in enumerate(path.vertices[1:-1]):
+        on &= within_sides(
+            world, batch.which[:, level], batch.patch[:, level], point, limit[:, level]
+        )
+    others = torch.nonzero(~rectangular).squeeze(-1)
+    if len(others):
+        rest = batch.take(others)
+        on[others] = on_faces(world, rest, vertices[others], normal[others], 0.0).all(1)
+    steps = [minus(b, a) for a, b in pairwise(path.vertices)]
+    lengths = [torch.sqrt(dot(step, step)) for step in steps]
+    front, apart = torch.ones_like(on), torch.ones_like(on)
+    for level, n in enumerate(path.normals):
+        front &= dot(steps[level], n) < -GRAZING * lengths[level]
+        front &= dot(steps[level + 1], n) > GRAZING * lengths[level + 1]
+    for length in lengths:
+        apart &= (length > COINCIDENT) & torch.isfinite(length)
+    status = torch.full_like(batch.link, int(Status.OK))
+    status[~front] = int(Status.WRONG_SIDE)
+    status[~on] = int(Status.OFF_SURFACE)
+    status[~apart] = int(Status.DEGENERATE)
+    return status
 
 
 # anything else: Newton on the Lagrangian
@@ -298,8 +331,8 @@ def on_faces(
     # a planar face is itself alone, its edges included: on a convex shape whatever lies on its plane
     # and on the surface is of it. A curved surface may be sought from another of its pieces
     patch = world.patch(which, x)
-    planar = world.plane(which, batch.patch.reshape(-1))[2]
-    curved = ~planar & ~world.plane(which, patch)[2]
+    planar = world.is_planar(which, batch.patch.reshape(-1))
+    curved = ~planar & ~world.is_planar(which, patch)
     same = (patch == batch.patch.reshape(-1)) | curved | (planar & world.convex[which])
     rim = torch.zeros_like(exact)
     i = torch.nonzero(exact & curved).squeeze(-1)

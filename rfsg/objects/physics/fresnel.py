@@ -107,9 +107,8 @@ class _SlabTerms:
 
     def __init__(self, cos_incidence: Tensor, eps_c: Tensor, thickness, frequency: Tensor):
         thickness = torch.as_tensor(thickness, dtype=frequency.dtype, device=frequency.device)
-        shape = torch.broadcast_shapes(
-            cos_incidence.shape, eps_c.shape, thickness.shape, frequency.shape
-        )
+        # torch.broadcast_shapes would load sympy first: seconds, for the shape of four tensors
+        shape = torch.broadcast_tensors(cos_incidence, eps_c, thickness, frequency)[0].shape
         self.cosine = _cosine(cos_incidence).expand(shape)
         self.thickness, self.frequency = thickness.expand(shape), frequency.expand(shape)
         eps_c = eps_c.expand(shape)

@@ -2,7 +2,6 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from manifold3d import triangulate
 from numpy import ndarray
 
 HOLLOW = 1e-9  # relative: corners that turn inward by less are straight
@@ -36,6 +35,8 @@ def _turns(corner: Float[ndarray, "q k 3"]) -> Float[ndarray, "q k"]:
 
 
 def _cut(point: Float[ndarray, "n 3"], polygon: Int[ndarray, "k"]) -> Int[ndarray, "t 3"]:
+    from manifold3d import triangulate  # loaded where a polygon needs it
+
     corner = point[polygon] - point[polygon].mean(0)
     normal = np.cross(corner, np.roll(corner, -1, 0)).sum(0)
     # two directions in the mean plane, right-handed with its normal (Newell)

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 MAX_TRIANGLES = 100_000  # a shape asks each of its triangles at every point
 LEVEL = (
@@ -153,5 +151,8 @@ def neighbours(corner: Int[ndarray, "t 3"]) -> tuple[Int[ndarray, "e 4"], Int[nd
 
 def components(count: int, links: Int[ndarray, "l 2"]) -> Int[ndarray, "n"]:
     """Number of the group of things that links hold together."""
+    from scipy.sparse import coo_array  # half a second, which scenes without meshes need not pay
+    from scipy.sparse.csgraph import connected_components
+
     ones = np.ones(len(links), dtype=bool)
     return connected_components(coo_array((ones, links.T), shape=(count, count)), False)[1]

@@ -14,11 +14,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool
 from numpy import ndarray
-from scipy.spatial import KDTree
 
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.edges.record import Edges, no_edges, straight_edges
-from rfsg.objects.shapes.proxy import DEFAULT_STEPS, FINEST, extract_mesh
 from rfsg.objects.shapes.topology import components, facets, neighbours
 
 MOST_PIECES = 1000  # flat pieces looked for in a learned surface
@@ -76,6 +74,9 @@ class _Piece:
 
 
 def _find(shape: Shape, angle_deg: float) -> Edges:
+    # brings scikit-image and manifold3d along
+    from rfsg.objects.shapes.proxy import DEFAULT_STEPS, FINEST, extract_mesh
+
     low, high = shape.bounds().tolist()
     step = max(max(b - a for a, b in zip(low, high, strict=True)) / DEFAULT_STEPS, FINEST)
     vertices, faces, _ = extract_mesh(shape, step)
@@ -171,6 +172,8 @@ def _meetings(pieces: list[_Piece], most: float, step: float) -> list[tuple[int,
     """Pairs of pieces that come close to each other, at an angle."""
     if not pieces:
         return []
+    from scipy.spatial import KDTree  # a third of a second: only learned shapes pay it
+
     trees = [KDTree(p.point) for p in pieces]
     low, high = (np.stack([f(p.point, 0) for p in pieces]) for f in (np.min, np.max))
     normal = np.stack([p.normal for p in pieces])
