@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from rfsg.objects.body import Body
@@ -19,7 +18,7 @@ from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World, unit
 from rfsg.tracer.march import MarchOptions, march
-from rfsg.tracer.zone import Facets, measure, take, zone_radius
+from rfsg.tracer.zone import Facets, joined, measure, take, zone_radius
 
 SHOTS = 4096  # rays shot at an object from around it; a 1 m object is sampled every 3 cm
 COARSE = MarchOptions(step_floor=5e-3)  # samples are only where to begin looking
@@ -163,22 +162,17 @@ def nearest_facets(
 ) -> Facets:
     """The measured facet of the sample nearest to each point: a first look that asks no network.
 
-    Samples are measured once for a shape and a wavelength, over a zone of a path of a few metres.
+    A sample is measured once for a shape and a wavelength, when it is first asked for, over a zone of
+    a path of a few metres.
     """
     local = world.point_object(which, point)
     found = []
     for shape, i in world.groups(which):
         scale = world.scale[which[i]]
-        tree, facets = _measured(shape, world.device, wavelength / float(scale[0]))
-        nearest = torch.from_numpy(tree.query(local[i].cpu().numpy())[1]).to(i.device)
-        found.append((i, take(facets, nearest)))
+        looks = _looks(shape, world.device, wavelength / float(scale[0]))
+        found.append((i, looks.nearest(local[i])))
     order = torch.argsort(torch.cat([i for i, _ in found]))
-    whole = Facets(
-        *(
-            torch.cat([getattr(f, name) for _, f in found])[order]
-            for name in Facets.__dataclass_fields__
-        )
-    )
+    whole = take(joined(*(f for _, f in found)), order)
     scale = world.scale[which]
     rows = [world.direction_world(which, whole.frame[:, k]) for k in range(3)]
     return Facets(
@@ -193,26 +187,56 @@ def nearest_facets(
     )
 
 
-_FACETS: dict[tuple[int, float], tuple[object, tuple[KDTree, Facets]]] = {}
 LOOK = 1.0  # [m] reduced distance d1 d2 / (d1 + d2) of the path that samples are measured for
 
 
-def _measured(shape: Shape, device: torch.device, wavelength: float) -> tuple[KDTree, Facets]:
-    """Facets of a shape's samples in its own frame, kept like the samples themselves."""
-    key = (id(shape), round(wavelength, 9))
-    state = _state(shape)
-    kept = _FACETS.get(key)
-    if kept is None or kept[0] != state:
-        if len(_FACETS) >= MOST_CACHED:
-            _FACETS.clear()
-        point, normal, _, _, curvature = _sampled(shape, device)
-        world = World(Scene((Node("/look", Body(shape, Conductor()), Pose.identity()),)), device)
-        which = torch.zeros(len(point), dtype=torch.int64, device=device)
+class Looks:
+    """The samples of a shape, and the facets of those that were asked for, in its own frame."""
+
+    def __init__(self, shape: Shape, device: torch.device, wavelength: float):
+        from scipy.spatial import KDTree  # loaded where a face is sampled
+
+        self.point, self.normal, _, _, curvature = _sampled(shape, device)
+        self.wavelength = wavelength
+        self.world = World(
+            Scene((Node("/look", Body(shape, Conductor()), Pose.identity()),)), device
+        )
         half = torch.full_like(curvature, 2.0 * LOOK)
-        radius = zone_radius(half, half, torch.ones_like(half), curvature, wavelength)
-        facets = measure(world, which, point, normal, radius, wavelength, 2, torch.float32)
-        kept = (state, (KDTree(point.cpu().numpy()), facets))
-        _FACETS[key] = kept
+        self.radius = zone_radius(half, half, torch.ones_like(half), curvature, wavelength)
+        self.tree = KDTree(self.point.cpu().numpy())
+        self.row = torch.full((len(self.point),), -1, dtype=torch.int64, device=device)
+        self.facets: Facets | None = None
+
+    def nearest(self, point: Float[Tensor, "m 3"]) -> Facets:
+        """The facet of the sample nearest to each point."""
+        sample = torch.from_numpy(self.tree.query(point.cpu().numpy())[1]).to(point.device)
+        asked = torch.unique(sample)
+        new = asked[self.row[asked] < 0]
+        if len(new):
+            self._measure(new)
+        assert self.facets is not None
+        return take(self.facets, self.row[sample])
+
+    def _measure(self, new: Int[Tensor, "k"]) -> None:
+        at = (torch.zeros_like(new), self.point[new], self.normal[new], self.radius[new])
+        found = measure(self.world, *at, self.wavelength, 2, torch.float32)
+        known = 0 if self.facets is None else len(self.facets.radius)
+        self.row[new] = known + torch.arange(len(new), device=new.device)
+        self.facets = found if self.facets is None else joined(self.facets, found)
+
+
+_LOOKS: dict[tuple[int, float], tuple[object, Looks]] = {}
+
+
+def _looks(shape: Shape, device: torch.device, wavelength: float) -> Looks:
+    """Looks at a shape, kept like the samples themselves."""
+    key, state = (id(shape), round(wavelength, 9)), _state(shape)
+    kept = _LOOKS.get(key)
+    if kept is None or kept[0] != state:
+        if len(_LOOKS) >= MOST_CACHED:
+            _LOOKS.clear()
+        kept = (state, Looks(shape, device, wavelength))
+        _LOOKS[key] = kept
     return kept[1]
 
 
@@ -227,6 +251,8 @@ def _neighbourhood(point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
     if len(point) <= NEIGHBOURS:
         far = torch.full_like(point[:, 0], torch.inf)
         return far, torch.zeros_like(far)
+    from scipy.spatial import KDTree
+
     found = KDTree(point.cpu().numpy()).query(point.cpu().numpy(), k=NEIGHBOURS + 1)
     distance, index = (np.asarray(x) for x in found)
     away = torch.from_numpy(distance[:, 1:]).to(point)

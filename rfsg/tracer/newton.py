@@ -1,6 +1,6 @@
 """Newton on the Lagrangian of a batch of chains: planes, exact shapes and measured facets alike."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,7 +9,7 @@ from torch import Tensor
 from rfsg.objects.contract import Jet
 from rfsg.scene.world import World
 from rfsg.tracer.implicit import kkt, multipliers, segments, solve_regular
-from rfsg.tracer.zone import Facets
+from rfsg.tracer.zone import Facets, take
 
 NEWTON_SETTLED = 1e-11  # of the path's length: the last Newton step of a converged chain
 ROUNDING = 64 * 2.0**-52  # of the coordinates: float64's own, through a Newton system
@@ -61,6 +61,23 @@ class Surfaces:
     learned: Bool[Tensor, "m"]
     facets: Facets | None
 
+    def take(self, chains: Int[Tensor, "k"], depth: int) -> "Surfaces":
+        """Those of some chains of a batch."""
+        i = (depth * chains[:, None] + torch.arange(depth, device=chains.device)).reshape(-1)
+        facets = self.facets
+        if facets is not None:
+            row = torch.cumsum(self.learned, 0) - 1
+            facets = take(facets, row[i[self.learned[i]]])
+        return Surfaces(
+            self.world,
+            self.which[i],
+            self.planar[i],
+            self.plane_normal[i],
+            self.plane_offset[i],
+            self.learned[i],
+            facets,
+        )
+
     def jet(self, x: Float[Tensor, "c d 3"]) -> Jet:
         flat = x.reshape(-1, 3)
         value = (flat * self.plane_normal).sum(-1) - self.plane_offset
@@ -92,25 +109,42 @@ def newton(
 
     index: of refraction, of what each segment runs in; 1 where None.
     """
-    x = batch.x
+    x = batch.x.clone()
     c, depth = batch.which.shape
     settled = torch.zeros(c, dtype=torch.bool, device=x.device)
+    going = torch.arange(c, device=x.device)
     for _ in range(rounds):
-        vertices = batch.polyline(x)
-        length, u = segments(vertices)
-        jet = surfaces.jet(x)
-        system = kkt(vertices, jet, multipliers(u, jet.gradient, index), index)
-        step, regular = solve_regular(system.matrix, system.residual[..., None])
-        dx = -step[:, : 3 * depth, 0].reshape(c, depth, 3)
-        # no further than half a segment, nor than half a radius of curvature: Newton's model ends there
-        bend = jet.hessian.flatten(2).norm(dim=-1).clamp(min=1e-300)
-        reach = 0.5 * torch.minimum(torch.minimum(length[:, :-1], length[:, 1:]), 1.0 / bend)
-        size = dx.norm(dim=-1)
-        shrink = torch.where(size > reach, reach / size.clamp(min=1e-300), 1.0).amin(1)
-        x = x + shrink[:, None, None] * dx
-        # coordinates far from the origin round coarser than the path is long
-        rounding = ROUNDING * vertices.abs().amax((1, 2))
-        settled = regular & (size.amax(1) <= NEWTON_SETTLED * length.sum(1) + rounding)
-        if bool(settled.all()):
+        moved, now = _step(batch, surfaces, index)
+        x[going], settled[going] = moved, now
+        # most chains settle in a few steps, and a few never do
+        left = torch.nonzero(~now).squeeze(-1)
+        if not len(left):
             break
+        if 2 * len(left) < len(going):
+            batch, surfaces, going = batch.take(left), surfaces.take(left, depth), going[left]
+            moved, index = moved[left], None if index is None else index[left]
+        batch = replace(batch, x=moved)
     return x, settled
+
+
+def _step(
+    batch: Batch, surfaces: Surfaces, index: Float[Tensor, "c s"] | None
+) -> tuple[Float[Tensor, "c d 3"], Bool[Tensor, "c"]]:
+    """One step of each chain, and whether it was its last."""
+    x = batch.x
+    c, depth = batch.which.shape
+    vertices = batch.polyline(x)
+    length, u = segments(vertices)
+    jet = surfaces.jet(x)
+    system = kkt(vertices, jet, multipliers(u, jet.gradient, index), index)
+    step, regular = solve_regular(system.matrix, system.residual[..., None])
+    dx = -step[:, : 3 * depth, 0].reshape(c, depth, 3)
+    # no further than half a segment, nor than half a radius of curvature: Newton's model ends there
+    bend = jet.hessian.flatten(2).norm(dim=-1).clamp(min=1e-300)
+    reach = 0.5 * torch.minimum(torch.minimum(length[:, :-1], length[:, 1:]), 1.0 / bend)
+    size = dx.norm(dim=-1)
+    shrink = torch.where(size > reach, reach / size.clamp(min=1e-300), 1.0).amin(1)
+    # coordinates far from the origin round coarser than the path is long
+    rounding = ROUNDING * vertices.abs().amax((1, 2))
+    settled = regular & (size.amax(1) <= NEWTON_SETTLED * length.sum(1) + rounding)
+    return x + shrink[:, None, None] * dx, settled

@@ -15,11 +15,12 @@ from torch import Tensor
 from rfsg.scene.world import World, unit
 from rfsg.tracer import zone
 from rfsg.tracer.faces import nearest_facets
+from rfsg.tracer.feet import Feet
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.newton import ROUNDING, Batch, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Status
-from rfsg.tracer.zone import Facets
+from rfsg.tracer.zone import Facets, Zones
 
 ON_SURFACE = 1e-7  # of the object's size: a polished vertex is orders closer, an edge passed is not
 SETTLED = 1e-11  # [m] a vertex moves less than this between rounds: gains to 1e-9 either way round
@@ -31,6 +32,8 @@ RESTLESS, SHRINKING = (
     0.05,
     0.7,
 )  # of its zone's radius: else it cycles between two views of a rough face
+STILL = 1e-4  # [m] a vertex that moves less stays on the face that it has, or on none
+RETURN = 5.0  # times its last move: a vertex comes back no further than this
 SAME = 1e-3  # [m] chains of one sequence this close after two rounds are on their way to one path
 
 
@@ -58,16 +61,59 @@ class State:
     moved: Float[Tensor, "c d 3"]
 
 
+@dataclass(frozen=True)
+class Seen:
+    """Where one solve led, whether it settled, and the surfaces met there: normals and bends."""
+
+    moved: Float[Tensor, "c d 3"]
+    settled: Tensor
+    normal: Float[Tensor, "c d 3"]
+    curvature: Float[Tensor, "c d"]
+
+
+@dataclass(frozen=True)
+class Settling:
+    """What all rounds of a batch have in common."""
+
+    world: World
+    wavelength: float
+    quality: Quality
+
+    def zones(
+        self, part: Batch, normal: Float[Tensor, "c d 3"], curvature: Float[Tensor, "c d"]
+    ) -> tuple[Zones, Float[Tensor, "c d"]]:
+        """Zones of the learned vertices (flat) and every vertex's zone radius."""
+        length, u = segments(part.polyline())
+        before = torch.cumsum(length, 1)[:, :-1]
+        after = length.sum(1, keepdim=True) - before
+        cosine = (u[:, :-1] * normal).sum(-1).abs()
+        radius = zone.zone_radius(before, after, cosine, curvature, self.wavelength)
+        which = part.which.reshape(-1)
+        i = torch.nonzero(~self.world.exact[which]).squeeze(-1)
+        x, n, reach = part.x.reshape(-1, 3)[i], normal.reshape(-1, 3)[i], radius.reshape(-1)[i]
+        rings = self.quality.zone_rings
+        return Zones(self.world, which[i], x, n, reach, self.wavelength, rings), radius
+
+    def solve(self, part: Batch, facets: Facets) -> Seen:
+        surfaces = surfaces_of(self.world, part, facets)
+        moved, settled = newton(part, surfaces, self.quality.newton)
+        bend = torch.zeros_like(surfaces.plane_offset)
+        bend[surfaces.learned] = facets.curvature()
+        normal = unit(surfaces.jet(moved).gradient)
+        return Seen(moved, settled, normal, bend.reshape(normal.shape[:2]))
+
+
 def settle(
     world: World, batch: Batch, wavelength: float, quality: Quality
 ) -> tuple[Float[Tensor, "c d 3"], Tensor, Charts]:
     """Vertices at rest, status [c] and the charts they rest on, of chains with learned vertices."""
     state = _start(world, batch)
     rows = torch.arange(len(batch.x), device=world.device)
-    rows = _round(world, batch, state, rows, wavelength, quality, look=True)
-    rows = _rounds(world, batch, state, rows, wavelength, quality, torch.float32)
-    precise = replace(quality, refits=PRECISE * quality.refits)
-    _rounds(world, batch, state, rows, wavelength, precise, torch.float64)
+    settling = Settling(world, wavelength, quality)
+    rows, _ = _round(settling, batch, state, rows, look=True)
+    rows = _rounds(settling, batch, state, rows, torch.float32)
+    precise = replace(settling, quality=replace(quality, refits=PRECISE * quality.refits))
+    _rounds(precise, batch, state, rows, torch.float64)
     return state.x, state.status, state.charts
 
 
@@ -83,23 +129,17 @@ def _start(world: World, batch: Batch) -> State:
 
 
 def _rounds(
-    world: World,
-    batch: Batch,
-    state: State,
-    rows: Tensor,
-    wavelength: float,
-    quality: Quality,
-    dtype: torch.dtype,
+    settling: Settling, batch: Batch, state: State, rows: Tensor, dtype: torch.dtype
 ) -> Tensor:
     """Rounds in one precision; returns the rows that came to rest in it."""
-    done = [rows[:0]]
-    for number in range(quality.refits):
-        if not len(rows):
-            break
-        going = _round(world, batch, state, rows, wavelength, quality, dtype=dtype, number=number)
+    done, feet = [rows[:0]], None
+    for number in range(settling.quality.refits):
+        going, feet = _round(settling, batch, state, rows, dtype=dtype, number=number, feet=feet)
         rested = state.status[rows] == int(Status.OK)
         done.append(rows[rested])
         rows = going
+        if not len(rows):
+            break
     ready = torch.cat(done)
     if dtype != torch.float64:
         state.status[ready] = int(Status.NOT_CONVERGED)  # until float64 has confirmed them
@@ -107,34 +147,35 @@ def _rounds(
 
 
 def _round(
-    world: World,
+    settling: Settling,
     batch: Batch,
     state: State,
     rows: Tensor,
-    wavelength: float,
-    quality: Quality,
     *,
     look: bool = False,
     dtype: torch.dtype = torch.float32,
     number: int = 0,
-) -> Tensor:
-    """One measurement and one solve of the rows given; returns those that go on."""
+    feet: Feet | None = None,
+) -> tuple[Tensor, Feet | None]:
+    """One measurement and one solve of the rows given; returns those that go on, and their feet."""
     if not len(rows):
-        return rows
+        return rows, None
+    world, precise = settling.world, dtype == torch.float64
     part = batch.take(rows)
     part.x = state.x[rows]
     learned = ~world.exact[part.which]
-    facets, radius = _measure(world, part, state, rows, wavelength, quality, look, dtype)
-    if not look:
+    zones, radius = settling.zones(part, state.charts.normal[rows], state.curvature[rows])
+    if look:
+        facets = nearest_facets(world, zones.which, zones.centre, settling.wavelength)
+    else:
+        facets, feet = zones.measured(dtype, feet)
         state.charts.centre[rows], state.charts.radius[rows] = part.x, radius
-    surfaces = surfaces_of(world, part, facets)
-    moved, settled = newton(part, surfaces, quality.newton)
-    change = moved - part.x
+    seen = settling.solve(part, facets)
+    moved, change = seen.moved, seen.moved - part.x
     step = change.norm(dim=-1).amax(-1)
-    precise = dtype == torch.float64
     least = SETTLED + ROUNDING * moved.abs().amax((1, 2)) if precise else NEARLY
-    at_rest = (not look) & settled & (step < least)
-    lost = _lost(world, part, moved, facets, learned, settled, precise, wavelength)
+    at_rest = (not look) & seen.settled & (step < least)
+    lost = _lost(settling, part, seen, facets, learned, precise, look or number == 0)
     restless = (step > RESTLESS * radius.amax(1) * SHRINKING ** (number - PATIENCE)) & (
         number >= PATIENCE
     )
@@ -150,12 +191,12 @@ def _round(
     mixed = _mixed(moved, change, state.moved[rows], state.before[rows])
     state.x[rows] = torch.where(leap, mixed, moved)
     state.before[rows], state.moved[rows] = change, moved
-    bend = torch.zeros_like(radius).reshape(-1)
-    bend[learned.reshape(-1)] = facets.curvature()
-    state.curvature[rows] = bend.reshape(radius.shape)
+    state.curvature[rows] = seen.curvature
     # the charts on which a row came to rest stay; those of a row that goes on turn with its surface
-    state.charts.normal[rows[go]] = unit(surfaces.jet(moved).gradient[go])
-    return rows[go]
+    state.charts.normal[rows[go]] = seen.normal[go]
+    if feet is not None:
+        feet = feet.take(torch.nonzero(go[torch.nonzero(learned)[:, 0]]).squeeze(-1))
+    return rows[go], feet
 
 
 def _twins(part: Batch, moved: Tensor) -> Tensor:
@@ -183,62 +224,47 @@ def _mixed(moved: Tensor, change: Tensor, moved_before: Tensor, before: Tensor) 
     return moved - share[:, None, None] * (moved - moved_before)
 
 
-def _measure(
-    world: World,
-    part: Batch,
-    state: State,
-    rows: Tensor,
-    wavelength: float,
-    quality: Quality,
-    look: bool,
-    dtype: torch.dtype,
-) -> tuple[Facets, Tensor]:
-    """Facets of the learned vertices (flat) and every vertex's zone radius [c d]."""
-    normal = state.charts.normal[rows]
-    length, u = segments(part.polyline())
-    before = torch.cumsum(length, 1)[:, :-1]
-    after = length.sum(1, keepdim=True) - before
-    cosine = (u[:, :-1] * normal).sum(-1).abs()
-    radius = zone.zone_radius(before, after, cosine, state.curvature[rows], wavelength)
-    which = part.which.reshape(-1)
-    i = torch.nonzero(~world.exact[which]).squeeze(-1)
-    point = part.x.reshape(-1, 3)[i]
-    if look:
-        return nearest_facets(world, which[i], point, wavelength), radius
-    direction, reach = normal.reshape(-1, 3)[i], radius.reshape(-1)[i]
-    rings = quality.zone_rings
-    return zone.measure(world, which[i], point, direction, reach, wavelength, rings, dtype), radius
-
-
 def _lost(
-    world: World,
+    settling: Settling,
     batch: Batch,
-    moved: Tensor,
+    seen: Seen,
     facets: Facets,
     learned: Tensor,
-    settled: Tensor,
     precise: bool,
-    wavelength: float,
+    first: bool,
 ) -> Tensor:
     """Why a chain is given up early (a Status), 0 while there is hope: most candidates end here."""
+    world, moved, wavelength = settling.world, seen.moved, settling.wavelength
     c, depth = batch.which.shape
+    stride = (moved - batch.x).norm(dim=-1)
+    still = stride.amax(1) < STILL
     hopeless = torch.zeros(c, dtype=torch.int64, device=moved.device)
     unresolved = torch.zeros_like(learned.reshape(-1))
-    unresolved[learned.reshape(-1)] = ~facets.resolved(wavelength)
+    unresolved[learned.reshape(-1)] = ~facets.resolved(wavelength, 1.0 if precise else MARGIN)
+    unresolved = unresolved.reshape(c, depth).any(1)
+    hopeless[unresolved & (still | precise)] = int(Status.UNRESOLVED)
     if precise:
-        hopeless[unresolved.reshape(c, depth).any(1)] = int(Status.UNRESOLVED)
-        hopeless[~settled] = int(Status.NOT_CONVERGED)
+        hopeless[~seen.settled] = int(Status.NOT_CONVERGED)
     which = batch.which.reshape(-1)
-    f = world.sdf(which, moved.reshape(-1, 3), torch.float32).abs().reshape(c, depth)
+    f, gradient = world.value_and_gradient(which, moved.reshape(-1, 3), torch.float32)
+    f, gradient = f.abs().reshape(c, depth), gradient.reshape(c, depth, 3)
     # a stationary point off the object by a tenth of its size is another object's business
     allowed = 2.0 * tolerance(world, batch, wavelength)
-    stride = (moved - batch.x).norm(dim=-1)
-    slack = allowed if precise else allowed + 0.03 * world.size[batch.which] + 0.1 * stride
+    far = torch.where(
+        learned, 0.03 * world.size[batch.which] + 0.1 * stride, EDGE_SLACK + 0.5 * stride
+    )
     # a mirror's own edge is as sharp as its object: an unfinished vertex may yet come back a little
-    near_edge = allowed if precise else EDGE_SLACK + 0.5 * stride
-    off = torch.where(learned, f > slack, f > near_edge)
+    far = torch.where(
+        (still | (not first))[:, None], torch.minimum(far, RETURN * stride + STILL), far
+    )
+    off = f > (allowed if precise else allowed + far)
+    if not first:
+        off |= learned & ((gradient * seen.normal).sum(-1) < 0)  # another face, seen from behind
     hopeless[off.any(1) | ~torch.isfinite(moved).all(-1).all(-1)] = int(Status.OFF_SURFACE)
     return hopeless
+
+
+MARGIN = 1.1  # by which a face may fail in float32 and be a mirror in float64
 
 
 def tolerance(world: World, batch: Batch, wavelength: float) -> Tensor:

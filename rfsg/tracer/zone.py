@@ -21,6 +21,7 @@ from torch import Tensor
 
 from rfsg.objects.contract import Jet
 from rfsg.scene.world import World, unit
+from rfsg.tracer.feet import Asked, Feet
 
 RELIEF = 1.0 / 16.0  # of a wavelength: what a mirror may depart from its quadric (Rayleigh's half)
 ALIGNED = (0.64, 0.87)  # cosines of 50 and 30 degrees: below the first a sample is another face
@@ -69,9 +70,11 @@ class Facets:
         root = torch.sqrt(torch.clamp(half_trace**2 - det, min=0.0))
         return half_trace.abs() + root
 
-    def resolved(self, wavelength: float) -> Bool[Tensor, "m"]:
-        """True where the zone holds enough of the face, and the face is a mirror to the wave."""
-        return (self.weight >= LEAST_WEIGHT) & (self.residual <= RELIEF * wavelength)
+    def resolved(self, wavelength: float, margin: float = 1.0) -> Bool[Tensor, "m"]:
+        """True where the zone holds enough of the face, and the face is a mirror to the wave; either
+        by a margin less if that is not 1."""
+        held = margin * self.weight >= LEAST_WEIGHT
+        return held & (self.residual <= margin * RELIEF * wavelength)
 
 
 def zone_radius(
@@ -102,26 +105,61 @@ def measure(
     ``dtype`` is the precision of the network's evaluation. Frames are laid out in the
     object's own frame, so moving the whole scene moves the answer and changes nothing else.
     """
-    normal_object = world.direction_object(which, normal)
-    rows = _tangents(normal_object)
-    frame_object = torch.cat([rows, normal_object[:, None]], 1)
-    frame = torch.stack([world.direction_world(which, frame_object[:, k]) for k in range(3)], 1)
-    whole = _fit(world, which, centre, frame, radius, wavelength, rings, dtype)
-    left = 1.0 - _trust(whole, wavelength)  # what smaller zones still have to say
-    whole = _scaled(whole, 1.0 - left)
-    for k, shrink in enumerate(SHRINKS[1:], 2):
-        i = torch.nonzero(left > 0).squeeze(-1)
-        if not len(i):
-            break
-        smaller = _fit(
-            world, which[i], centre[i], frame[i], shrink * radius[i], wavelength, rings, dtype
-        )
-        # the smallest takes what is left, trusted or not: ``resolved`` has the last word
-        trust = _trust(smaller, wavelength)
-        share = left[i] * (trust if k < len(SHRINKS) else torch.ones_like(trust))
-        whole = _added(whole, i, smaller, share)
-        left = left.index_copy(0, i, left[i] - share)
-    return whole
+    zones = Zones(world, which, centre, normal, radius, wavelength, rings)
+    return zones.fitted(Asked(world, which, dtype))
+
+
+@dataclass(frozen=True)
+class Zones:
+    """Zones about vertices, to be fitted to what their samples find: see ``measure``."""
+
+    world: World
+    which: Int[Tensor, "m"]
+    centre: Float[Tensor, "m 3"]
+    normal: Float[Tensor, "m 3"]
+    radius: Float[Tensor, "m"]
+    wavelength: float
+    rings: int
+
+    def measured(self, dtype: torch.dtype, before: Feet | None) -> tuple[Facets, Feet]:
+        """Quadrics by the network, and the samples' feet; ``before``: those of zones close by."""
+        asked = Asked(self.world, self.which, dtype, before)
+        return self.fitted(asked), asked.feet
+
+    def fitted(self, source: Asked) -> Facets:
+        normal_object = self.world.direction_object(self.which, self.normal)
+        axes = torch.cat([_tangents(normal_object), normal_object[:, None]], 1)
+        axes = [self.world.direction_world(self.which, axes[:, k]) for k in range(3)]
+        frame, rows = torch.stack(axes, 1), torch.arange(len(self.which), device=self.which.device)
+        whole = self._fit(source, 0, rows, frame)
+        left = 1.0 - _trust(whole, self.wavelength)  # what smaller zones still have to say
+        whole = _scaled(whole, 1.0 - left)
+        for level in range(1, len(SHRINKS)):
+            kept = torch.nonzero(left[rows] > 0).squeeze(-1)
+            if not len(kept):
+                break
+            rows = rows[kept]
+            smaller = self._fit(source, level, rows, frame[rows])
+            # the smallest takes what is left, trusted or not: ``resolved`` has the last word
+            trust = _trust(smaller, self.wavelength)
+            last = level == len(SHRINKS) - 1
+            share = left[rows] * (torch.ones_like(trust) if last else trust)
+            whole = _added(whole, rows, smaller, share)
+            left = left.index_copy(0, rows, left[rows] - share)
+        return whole
+
+    def _fit(self, source: Asked, level: int, rows: Tensor, frame: Tensor) -> Facets:
+        """Quadrics of one size of zone."""
+        radius, centre = SHRINKS[level] * self.radius[rows], self.centre[rows]
+        uv, normal = disc(self.rings, centre), frame[:, 2]
+        plane = torch.einsum("qk,mkj->mqj", uv, frame[:, :2]) * radius[:, None, None]
+        base = centre[:, None] + plane
+        drop = source.drop(level, rows, base, normal, radius)
+        taper = torch.exp(-2.0 * (uv * uv).sum(-1))
+        weight = taper * _smoothstep(drop.aligned(normal), *ALIGNED)
+        weight = weight * torch.exp(-((drop.missed / (0.02 * radius[:, None])) ** 2))
+        weight = weight * torch.exp(-((drop.height / (SHEET * self.wavelength)) ** 4))
+        return _least_squares(centre, frame, radius, uv, drop.height, weight, taper.sum())
 
 
 def _tangents(normal: Float[Tensor, "m 3"]) -> Float[Tensor, "m 2 3"]:
@@ -173,47 +211,6 @@ def disc(rings: int, like: Tensor) -> Float[Tensor, "q 2"]:
     return torch.cat(points).to(like)
 
 
-def _fit(
-    world: World,
-    which: Tensor,
-    centre: Tensor,
-    frame: Tensor,
-    radius: Tensor,
-    wavelength: float,
-    rings: int,
-    dtype: torch.dtype,
-) -> Facets:
-    uv = disc(rings, centre)
-    m, q = len(which), len(uv)
-    flat = which.repeat_interleave(q)
-    plane = torch.einsum("qk,mkj->mqj", uv, frame[:, :2]) * radius[:, None, None]
-    normal = frame[:, 2].repeat_interleave(q, 0)
-    base = (centre[:, None] + plane).reshape(-1, 3)
-    height, aligned, missed = _drop(world, flat, base, normal, radius.repeat_interleave(q), dtype)
-    height, aligned, missed = (x.reshape(m, q) for x in (height, aligned, missed))
-    taper = torch.exp(-2.0 * (uv * uv).sum(-1))
-    weight = taper * _smoothstep(aligned, *ALIGNED)
-    weight = weight * torch.exp(-((missed / (0.02 * radius[:, None])) ** 2))
-    weight = weight * torch.exp(-((height / (SHEET * wavelength)) ** 4))
-    return _least_squares(centre, frame, radius, uv, height, weight, taper.sum())
-
-
-def _drop(
-    world: World, which: Tensor, base: Tensor, normal: Tensor, reach: Tensor, dtype: torch.dtype
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Height of the zero set over base points along a normal, its alignment, and the |f| before the
-    last of three Newton steps: what finds no surface stays large."""
-    height = base.new_zeros(len(base))
-    aligned = missed = height
-    for _ in range(3):
-        value, gradient = world.value_and_gradient(which, base + height[:, None] * normal, dtype)
-        along = (gradient * normal).sum(-1)
-        step = value / torch.where(along.abs() > 0.2, along, torch.ones_like(along))
-        height = (height - step).clamp(-reach, reach)
-        aligned, missed = (unit(gradient) * normal).sum(-1), value.abs()
-    return height, aligned, missed
-
-
 def _smoothstep(x: Tensor, low: float, high: float) -> Tensor:
     t = ((x - low) / (high - low)).clamp(0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
@@ -262,3 +259,9 @@ RIDGE = 1e-6
 def take(facets: Facets, i: Tensor) -> Facets:
     """The facets of a selection of vertices."""
     return Facets(*(getattr(facets, name)[i] for name in Facets.__dataclass_fields__))
+
+
+def joined(*parts: Facets) -> Facets:
+    """Facets after one another."""
+    columns = ([getattr(p, name) for p in parts] for name in Facets.__dataclass_fields__)
+    return Facets(*(torch.cat(column) for column in columns))
