@@ -12,8 +12,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Shape
+from rfsg.objects.shapes.kept import baked_if_it_pays
 from rfsg.scene.world import World
 from rfsg.tracer.embree import sort_by
+from rfsg.tracer.intersect import baked_roots
 from rfsg.tracer.records import Crossings, Rays, Spans
 from rfsg.tracer.seams import ASIDE, along_seams
 
@@ -26,12 +28,14 @@ FORWARD = ASIDE  # no direction of a drawing is at right angles to it
 @dataclass(frozen=True)
 class MarchOptions:
     """step_floor: least step [m], so the thinnest thing sure to be seen. dtype: float32 to search,
-    float64 to evaluate. polish: bisection-safe secant steps on a bracket. chunk: spans at a time."""
+    float64 to evaluate. polish: bisection-safe secant steps on a bracket. chunk: spans at a time.
+    intersection: how a learned shape is met once it is baked, one of ``intersect.WAYS``."""
 
     step_floor: float = 2e-3
     dtype: torch.dtype = torch.float32
     polish: int = 6
     chunk: int = 65_536
+    intersection: str = "certain"
 
 
 SEARCH = MarchOptions()
@@ -164,11 +168,40 @@ def march(
     """Stretches (row, enter, leave) where f < 0 along start + t direction, 0 <= t <= length [m].
 
     A shape that is not convex may say them in closed form. Else steps are max(|f| / L, step_floor):
-    with L a true bound none skips anything thicker than the floor.
+    with L a true bound none skips anything thicker than the floor. A network that many rays have met
+    is baked, and then asked only near its surface.
     """
     own = getattr(shape, "stretches", None)
     if own is not None and not shape.convex:
         return own(start, direction, length)
+    baked = baked_if_it_pays(shape, len(start))
+    if baked is None:
+        return plain_march(shape, start, direction, length, options)
+    p0, d, end = (x.to(options.dtype) for x in (start, direction, length))
+    found = baked_roots(
+        shape,
+        baked,
+        p0,
+        d,
+        end,
+        options.intersection,
+        options.step_floor,
+        MOST_ROOTS,
+        options.polish,
+    )
+    roots = end.new_full((len(end), MOST_ROOTS), torch.inf)
+    roots[found.row, found.slot] = found.t
+    return _pair(roots, found.count, found.inside, end)
+
+
+def plain_march(
+    shape: Shape,
+    start: Float[Tensor, "m 3"],
+    direction: Float[Tensor, "m 3"],
+    length: Float[Tensor, "m"],
+    options: MarchOptions,
+) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Float[Tensor, "k"]]:
+    """``march`` by the shape alone, each step at its own value of f: what the faster ways are held to."""
     dtype = options.dtype
     p0, d, end = start.to(dtype), direction.to(dtype), length.to(dtype)
     t = torch.zeros_like(end)

@@ -5,20 +5,21 @@ are cut off at the scale of the step. Whatever must be exact asks the shape itse
 """
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from manifold3d import Manifold, Mesh64
 from numpy import ndarray
 from skimage.measure import marching_cubes
 from torch import Tensor
 
 from rfsg.objects.contract import Shape
+from rfsg.objects.shapes.band import BLOCK
 
 DEFAULT_STEPS = 100  # cells along the longest side, unless that makes them finer than FINEST
 FINEST = 0.002  # [m]
-BLOCK = 4  # cells per side of a coarse block: one value decides about 64 cells
 MAX_NODES = 50_000_000  # 400 MB of float64; a finer grid is more likely a slip than a wish
 
 
@@ -35,46 +36,90 @@ def extract_mesh(
     Raises ValueError for an unbounded shape, a step that is not positive or makes too fine a grid,
     or a shape without a surface within its bounds.
     """
-    low, step, blocks = _grid(shape, resolution)
-    values = _sample(shape, low, step, blocks)
-    if not (values.min() < 0 < values.max()):
+    sampled = sample_field(shape, resolution)
+    vertices, faces = level_set(sampled, 0.0)
+    vertices = _polish(shape, vertices, sampled.step)
+    if simplify is not None:
+        vertices, faces = simplified(vertices, faces, simplify)
+    return vertices, faces, _normals(shape, vertices)
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A shape's field on a grid: values [x y z] at the nodes low + index * step, [m].
+
+    The grid is made of blocks of BLOCK cells a side. In those that are not ``busy`` the surface
+    cannot be, and ``values`` repeat the field at the block's middle (``middle``).
+    """
+
+    low: Float[Tensor, "3"]
+    step: float
+    values: Float[ndarray, "x y z"]
+    middle: Float[Tensor, "bx by bz"]
+    busy: Bool[Tensor, "bx by bz"]
+
+
+def sample_field(shape: Shape, resolution: float | None, band: float = 0.0) -> Sampled:
+    """The field at all nodes where |f| may be ``band`` [m] or less, on a grid that reaches as far
+    beyond the bounds. Raises ValueError as ``extract_mesh`` does."""
+    low, step, blocks = _grid(shape, resolution, band)
+    sampled = _sample(shape, low, step, blocks, band)
+    if not (sampled.values.min() < 0 < sampled.values.max()):
         raise ValueError(
             f"{shape.kind} shape has no surface on a grid of {step:.4g} m within "
             f"{shape.bounds().tolist()}: it is empty, or thinner than the grid"
         )
-    vertices, faces, _, _ = marching_cubes(values, 0.0, spacing=(step,) * 3)
-    vertices = _polish(shape, vertices + low.numpy(), step)
-    faces = faces.astype(np.int64)
-    if simplify is not None:
-        solid = Manifold(Mesh64(vertices, faces.astype(np.uint64))).simplify(simplify)
-        raw = solid.to_mesh64()
-        vertices, faces = raw.vert_properties[:, :3].copy(), raw.tri_verts.astype(np.int64)
-    return vertices, faces, _normals(shape, vertices)
+    return sampled
 
 
-def _grid(shape: Shape, resolution: float | None) -> tuple[Tensor, float, list[int]]:
-    """Lowest node, step [m] and number of blocks of a grid with one cell or more to spare."""
+def level_set(sampled: Sampled, level: float) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "t 3"]]:
+    """Vertices [m] and triangles of the surface f = level, by marching cubes (Lewiner 2003)."""
+    step = (sampled.step,) * 3
+    vertices, faces, _, _ = marching_cubes(sampled.values, level, spacing=step)
+    return vertices + sampled.low.numpy(), faces.astype(np.int64)
+
+
+def simplified(
+    vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "t 3"], tolerance: float
+) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "s 3"]]:
+    """The closed mesh with fewer triangles, its surface moved by at most ``tolerance`` [m]; one that
+    touches itself, as level sets through nodes of their grid may, stays as it is."""
+    solid = Manifold(Mesh64(vertices.astype(np.float64), faces.astype(np.uint64)))
+    if solid.is_empty():
+        return vertices, faces
+    raw = solid.simplify(tolerance).to_mesh64()
+    return raw.vert_properties[:, :3].copy(), raw.tri_verts.astype(np.int64)
+
+
+def _grid(
+    shape: Shape, resolution: float | None, spare: float = 0.0
+) -> tuple[Tensor, float, list[int]]:
+    """Lowest node, step [m] and number of blocks of a grid with one cell and ``spare`` [m] or more
+    beyond the bounds on each side."""
     low, high = shape.bounds().detach().to("cpu", torch.float64)
     if not bool((high - low).isfinite().all()):
         raise ValueError(f"{shape.kind} shape is unbounded: it has no mesh")
     step = resolution or max(float((high - low).max()) / DEFAULT_STEPS, FINEST)
     if not (step > 0 and math.isfinite(step)):
         raise ValueError(f"resolution={resolution!r}: expected a positive step in metres")
+    low, high = low - spare, high + spare
     blocks = [math.ceil((side / step + 2) / BLOCK) for side in (high - low).tolist()]
     if math.prod(BLOCK * n + 1 for n in blocks) > MAX_NODES:
         raise ValueError(
             f"resolution={step:.3g} m needs more than {MAX_NODES} nodes: take a larger"
         )
-    spare = torch.tensor(blocks) * BLOCK * step - (high - low)
-    return low - spare / 2, step, blocks
+    over = torch.tensor(blocks) * BLOCK * step - (high - low)
+    return low - over / 2, step, blocks
 
 
-def _sample(shape: Shape, low: Tensor, step: float, blocks: list[int]) -> ndarray:
-    """Field at all nodes; in blocks that cannot hold the surface only its sign is right."""
-    reach = shape.lipschitz * math.sqrt(3) * BLOCK * step / 2
+def _sample(
+    shape: Shape, low: Tensor, step: float, blocks: list[int], band: float = 0.0
+) -> Sampled:
+    """Field at all nodes; in blocks where |f| must exceed the band only its sign is right."""
+    reach = band + shape.lipschitz * math.sqrt(3) * BLOCK * step / 2
     counts = torch.tensor(blocks)
     index = torch.cartesian_prod(*(torch.arange(n) for n in blocks)).reshape(-1, 3)
-    middle = _field(shape, low + (index + 0.5) * BLOCK * step).reshape(blocks)
+    middle = field_at(shape, low + (index + 0.5) * BLOCK * step).reshape(blocks)
     values = middle
     busy = middle.abs() <= reach
     for axis in range(3):
@@ -87,12 +132,12 @@ def _sample(shape: Shape, low: Tensor, step: float, blocks: list[int]) -> ndarra
     x, rest = flat // (size[1] * size[2]), flat % (size[1] * size[2])
     node = torch.stack([x, rest // size[2], rest % size[2]], -1)
     values = values.contiguous().reshape(-1)
-    values[flat] = _field(shape, low + node * step)
-    return values.reshape(tuple(size.tolist())).numpy()
+    values[flat] = field_at(shape, low + node * step)
+    return Sampled(low, step, values.reshape(tuple(size.tolist())).numpy(), middle, busy)
 
 
 @torch.no_grad()
-def _field(shape: Shape, point: Tensor) -> Tensor:
+def field_at(shape: Shape, point: Tensor) -> Tensor:
     """sdf within the bounds; beyond them, where it means nothing, the distance to them is added."""
     box = shape.bounds().to(torch.float64)
     point = point.to(box.device)

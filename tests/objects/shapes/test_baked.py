@@ -1,0 +1,186 @@
+"""What is baked of a shape holds for it, and files of it are trusted no further than they prove."""
+
+import json
+import warnings
+
+import pytest
+import torch
+import trimesh
+from safetensors.torch import load, save
+
+from rfsg.objects.shapes import kept
+from rfsg.objects.shapes.baked import bake, key_of
+from rfsg.objects.shapes.neural import NeuralShape
+from rfsg.objects.shapes.refined import refined
+from tests.tracer.shapes import Field, ball, two_walls
+
+STEP = 0.02
+
+
+def small(seed=0):
+    return NeuralShape(
+        [[-0.3] * 3, [0.3] * 3], width=16, depth=3, skip=1, lipschitz=2.0, seed=seed
+    ).requires_grad_(False)
+
+
+def inside(shape, count, seed=0):
+    low, high = shape.bounds().float()
+    generator = torch.Generator().manual_seed(seed)
+    return low + (high - low) * torch.rand(count, 3, generator=generator)
+
+
+@pytest.fixture(autouse=True)
+def nothing_kept(monkeypatch):
+    monkeypatch.setattr(kept, "_MEMORY", {})
+
+
+@pytest.mark.parametrize("shape", [small(), Field(ball(0.3), [0.4] * 3, lipschitz=1.0)])
+def test_values_err_by_no_more_than_their_doubt(shape):
+    made = bake(shape, STEP)
+    point = inside(shape, 20_000)
+    value, doubt = made.look(point)
+    assert bool(((shape.sdf(point) - value).abs() <= doubt + 2e-6).all())
+
+
+def test_a_shell_holds_what_a_grid_steps_over():
+    """Two plates of 12 mm on a grid of 20 mm: every point of them is within the shell."""
+    shape = Field(two_walls(0.2, 0.012), [0.3, 0.3, 0.3], lipschitz=1.0)
+    for shift in (0.0, 0.003, 0.006, 0.009):
+        moved = Field(lambda p, s=shift: shape.f(p - p.new_tensor([s, 0.0, 0.0])), [0.3] * 3, 1.0)
+        try:
+            made = bake(moved, STEP)
+        except ValueError:
+            continue  # nothing on the grid: such a shape is never baked, and the plain march is used
+        shell = trimesh.Trimesh(made.shell.vertices.numpy(), made.shell.triangles.numpy())
+        assert shell.is_watertight
+        sheet = inside(moved, 400)
+        sheet[:, 0] = torch.where(sheet[:, 0] > 0, 0.106, -0.106) + shift
+        assert bool(shell.contains(sheet.numpy()).all())
+
+
+def test_zero_mesh_is_closed_and_split_until_it_follows_the_surface():
+    shape = Field(ball(0.3), [0.4] * 3, lipschitz=1.0)
+    made = bake(shape, 0.04)
+    mesh = trimesh.Trimesh(made.zero.vertices.numpy(), made.zero.triangles.numpy(), process=False)
+    assert mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0
+    ends = made.zero.vertices[torch.tensor(mesh.edges_unique)]
+    # of a chord of length c the middle is c^2 / 8 R below a sphere
+    assert float(shape.sdf(ends.mean(1)).abs().max()) < 1e-4
+    coarse = refined(shape, made.zero.vertices, made.zero.triangles, 0.04, 5e-5, 0)
+    assert len(coarse[1]) == len(made.zero.triangles)
+
+
+def test_key_follows_weights_and_settings():
+    shape = small()
+    keys = {
+        key_of(shape, STEP),
+        key_of(small(), STEP),
+        key_of(shape, 2 * STEP),
+        key_of(small(1), STEP),
+    }
+    assert len(keys) == 3
+    before = key_of(shape, STEP)
+    shape.to_value.bias.add_(1e-6)
+    assert key_of(shape, STEP) != before
+
+
+def test_memory_forgets_a_shape_that_changed():
+    shape = small()
+    first = kept.baked(shape, step=STEP)
+    assert kept.baked(shape, step=STEP) is first
+    shape.to_value.bias.add_(1e-3)
+    assert kept.baked(shape, step=STEP).key != first.key
+
+
+def test_a_file_comes_back_as_it_was(tmp_path, monkeypatch):
+    shape = small()
+    first = kept.baked(shape, tmp_path, STEP)
+    assert [f.name for f in tmp_path.iterdir()] == [f"{first.key[:32]}.baked.safetensors"]
+    kept._MEMORY.clear()
+    monkeypatch.setattr(kept, "bake", lambda *_: pytest.fail("baked again"))
+    again = kept.baked(shape, tmp_path, STEP)
+    point = inside(shape, 1000)
+    assert all(torch.equal(a, b) for a, b in zip(first.look(point), again.look(point), strict=True))
+    assert torch.equal(first.zero.triangles, again.zero.triangles)
+    assert (first.level, first.margin, first.slope) == (again.level, again.margin, again.slope)
+
+
+def test_a_folder_that_may_only_be_read_is_no_fault(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise PermissionError("read-only")
+
+    monkeypatch.setattr("pathlib.Path.write_bytes", refuse)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(kept.baked(small(), tmp_path, STEP).zero.triangles) > 100
+    assert not list(tmp_path.iterdir())
+
+
+def _beyond(tensors, head):
+    tensors["block"] = tensors["block"] + 10_000
+
+
+def _no_corner(tensors, head):
+    tensors["zero.triangles"] = tensors["zero.triangles"] - 5
+
+
+def _not_a_number(tensors, head):
+    tensors["values"][0, 0] = torch.nan
+
+
+def _another(tensors, head):
+    head["key"] = "0" * 64
+
+
+def _fewer(tensors, head):
+    del tensors["error"]
+
+
+def _wide(tensors, head):
+    tensors["error"] = tensors["error"].double()
+
+
+def _short(tensors, head):
+    tensors["gradient"] = tensors["gradient"][:-1]
+
+
+def _endless(tensors, head):
+    head["slope"] = -1.0
+
+
+SPOILED = [_beyond, _no_corner, _not_a_number, _another, _fewer, _wide, _short, _endless]
+
+
+@pytest.mark.parametrize("spoil", SPOILED, ids=[f.__name__ for f in SPOILED])
+def test_a_spoiled_file_is_ignored_with_a_warning(spoil, tmp_path):
+    shape = small()
+    first = kept.baked(shape, tmp_path, STEP)
+    (path,) = tmp_path.iterdir()
+    data = path.read_bytes()
+    head = kept._head(data)
+    tensors = {name: tensor.clone() for name, tensor in load(data).items()}
+    spoil(tensors, head)
+    path.write_bytes(
+        save({k: v.contiguous() for k, v in tensors.items()}, {"rfsg-baked": json.dumps(head)})
+    )
+    kept._MEMORY.clear()
+    with pytest.warns(UserWarning, match="ignored, the shape is baked again"):
+        again = kept.baked(shape, tmp_path, STEP)
+    assert torch.equal(first.values, again.values)
+
+
+@pytest.mark.parametrize("content", [b"", b"x" * 7, b"\xff" * 64, b"\x02" + 7 * b"\0" + b"[]"])
+def test_what_is_no_safetensors_file_is_ignored(content, tmp_path):
+    shape = small()
+    (tmp_path / f"{key_of(shape, STEP)[:32]}{kept.ENDING}").write_bytes(content)
+    with pytest.warns(UserWarning, match="ignored"):
+        assert len(kept.baked(shape, tmp_path, STEP).values)
+
+
+def test_a_file_too_large_is_not_read(tmp_path, monkeypatch):
+    shape = small()
+    kept.baked(shape, tmp_path, STEP)
+    kept._MEMORY.clear()
+    monkeypatch.setattr(kept, "MAX_BYTES", 100)
+    with pytest.warns(UserWarning, match="the limit is 100"):
+        kept.baked(shape, tmp_path, STEP)

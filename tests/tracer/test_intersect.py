@@ -1,0 +1,240 @@
+"""Fast ways to meet a learned shape, held to the plain march, to closed forms and to dense sampling."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from rfsg.objects.shapes import kept
+from rfsg.objects.shapes.analytic import Box
+from rfsg.objects.shapes.baked import bake
+from rfsg.objects.shapes.neural import NeuralShape
+from rfsg.scene.assets import load_asset
+from rfsg.tracer import march as marching
+from rfsg.tracer.intersect import WAYS, Intersector, baked_roots
+from rfsg.tracer.march import EVALUATE, SEARCH, march, plain_march
+from rfsg.tracer.plan import Quality
+from tests.tracer.shapes import Field, ball
+
+ASSETS = Path(__file__).resolve().parents[2] / "assets" / "objects"
+FLOOR = 1e-3
+
+
+def around(shape, count, seed=0):
+    """Rays from 3 m away at points in and beside the bounds, cut to them: half of them miss."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = shape.bounds().double()
+    centre = 0.5 * (low + high)
+    away = torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    origin = centre + 3.0 * torch.nn.functional.normalize(away, dim=-1)
+    share = 2.0 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1.0
+    direction = torch.nn.functional.normalize(centre + 0.6 * (high - low) * share - origin, dim=-1)
+    ends = torch.stack([(low - origin) / direction, (high - origin) / direction])
+    enter, leave = ends.amin(0).amax(-1), ends.amax(0).amin(-1)
+    met = leave > enter.clamp(min=0.0)
+    origin = (origin + enter[:, None] * direction)[met]
+    return origin, direction[met], (leave - enter)[met]
+
+
+class Squashed(Field):
+    """Another shape with the same zero set: f becomes ``change(f)``."""
+
+    def __init__(self, inner, change, slope):
+        super().__init__(lambda p: change(inner.sdf(p)), [1.0] * 3, slope * inner.lipschitz)
+        self.inner = inner.requires_grad_(False)
+
+    def bounds(self):
+        return self.inner.bounds()
+
+
+def trained(name):
+    return load_asset(ASSETS / name / f"{name}.usda").body.shape.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def chair():
+    shape = trained("chair")
+    return shape, bake(shape, 0.01)
+
+
+def stretches(shape, made, rays, options, monkeypatch):
+    monkeypatch.setattr(marching, "baked_if_it_pays", lambda *_: made)
+    return march(shape, *rays, options)
+
+
+def differences(one, other, count):
+    """(rays whose number of stretches differs, errors of the ends of the others [m])."""
+    counts = [torch.bincount(rows, minlength=count) for rows, _, _ in (one, other)]
+    same = counts[0] == counts[1]
+    ends = [torch.stack(part[1:])[:, same[part[0]]] for part in (one, other)]
+    return torch.nonzero(~same).squeeze(-1), (ends[0] - ends[1]).abs()
+
+
+@pytest.mark.parametrize("change", ["itself", "twice", "squashed"])
+def test_certain_crossings_are_the_plain_marchs(change, chair, monkeypatch):
+    shape, made = chair
+    if change != "itself":
+        law = {"twice": lambda f: 2.0 * f, "squashed": lambda f: 0.05 * torch.tanh(f / 0.05)}
+        shape = Squashed(shape, law[change], 2.0 if change == "twice" else 1.0)
+        made = bake(shape, 0.01)
+    rays = around(shape, 500)
+    options = replace(EVALUATE, step_floor=FLOOR)
+    plain = plain_march(shape, *rays, options)
+    fast = stretches(shape, made, rays, options, monkeypatch)
+    other, error = differences(plain, fast, len(rays[0]))
+    assert len(plain[0]) > 150
+    # two marches may differ only in what is thinner than their least step
+    for row in other.tolist():
+        thin = [leave - enter for r, enter, leave in zip(*plain, strict=True) if r == row]
+        thin += [leave - enter for r, enter, leave in zip(*fast, strict=True) if r == row]
+        assert min(thin) < FLOOR
+    assert float(error.max()) < 1e-8
+
+
+def test_float32_crossings_are_those_of_float64(chair, monkeypatch):
+    shape, made = chair
+    rays = around(shape, 2000, seed=1)
+    coarse = replace(SEARCH, step_floor=FLOOR)
+    low = stretches(shape, made, rays, coarse, monkeypatch)
+    high = stretches(shape, made, rays, replace(EVALUATE, step_floor=FLOOR), monkeypatch)
+    other, error = differences(low, high, len(rays[0]))
+    assert len(other) <= 2
+    assert float(torch.quantile(error, 0.95)) < 2e-5
+
+
+# what each way promises here, on a grid of 1 cm: (share of hits lost or false, error [m] of 90 %)
+PROMISED = {
+    "certain": (0.0, 5e-5), "newton": (0.01, 5e-5), "mesh": (0.01, 2e-4), "grid": (0.04, 1e-3),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def met(chair):
+    rays = around(chair[0], 2000, seed=2)
+    return rays, plain_march(chair[0], *rays, replace(EVALUATE, step_floor=FLOOR))
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_first_hits_err_by_no_more_than_promised(way, chair, met):
+    shape, made = chair
+    rays, (row, enter, leave) = met
+    thick = leave - enter > 2.0 * FLOOR
+    inf = torch.full((len(rays[0]),), torch.inf, dtype=torch.float64)
+    truth = inf.scatter_reduce(0, row, enter, "amin")
+    sure = inf.scatter_reduce(0, row[~thick], enter[~thick], "amin") > truth
+    hits = Intersector(shape, made).first_hits(*rays, way)
+    found = inf.index_copy(0, hits.ray, hits.t.double())
+    share, error = PROMISED[way]
+    lost = (torch.isfinite(truth) & ~torch.isfinite(found) & sure).sum()
+    untrue = (torch.isfinite(found) & ~torch.isfinite(truth)).sum()
+    # a false hit may be a chip of the surface thinner than the plain march's least step
+    point = rays[0] + found.nan_to_num(posinf=0.0)[:, None] * rays[1]
+    chip = shape.sdf(point).abs() < 1e-5
+    untrue = (
+        untrue if way != "certain" else (untrue - (chip & torch.isinf(truth)).sum()).clamp(min=0)
+    )
+    assert float(lost + untrue) <= share * len(row)
+    both = torch.isfinite(truth) & torch.isfinite(found)
+    assert float(torch.quantile((truth - found)[both].abs(), 0.9)) <= error
+
+
+def test_a_hit_normal_is_the_networks(chair):
+    shape, made = chair
+    rays = around(shape, 2000, seed=3)
+    hits = Intersector(shape, made, network_normals=True).first_hits(*rays)
+    point = rays[0][hits.ray] + hits.t[:, None] * rays[1][hits.ray]
+    gradient = torch.nn.functional.normalize(shape.value_and_gradient(point)[1], dim=-1)
+    turn = torch.linalg.cross(gradient, hits.normal.double()).norm(dim=-1)
+    assert float(torch.quantile(turn, 0.95)) < 0.02
+    assert float((gradient * hits.normal).sum(-1).min()) > 0.0
+
+
+def test_rays_from_within_leave(chair):
+    """A ray that begins inside first meets the surface from behind."""
+    ball_shape = Field(ball(0.3), [0.4] * 3, lipschitz=1.0)
+    made = bake(ball_shape, 0.01)
+    torch.manual_seed(0)
+    origin = 0.1 * torch.randn(500, 3, dtype=torch.float64)
+    origin = origin[origin.norm(dim=-1) < 0.28]
+    direction = torch.nn.functional.normalize(torch.randn_like(origin), dim=-1)
+    along = (origin * direction).sum(-1)
+    exact = -along + (along**2 - (origin**2).sum(-1) + 0.09).sqrt()
+    hits = Intersector(ball_shape, made).first_hits(origin, direction, torch.ones(len(origin)))
+    assert sorted(hits.ray.tolist()) == list(range(len(origin)))
+    torch.testing.assert_close(hits.t.double(), exact[hits.ray], atol=5e-5, rtol=0)
+
+
+def pane(squash: bool):
+    """A 5 cm wall whose middle is a 1 cm pane; squashed, as a network with a slope of a half is."""
+
+    def f(p):
+        hole = 0.3 - torch.maximum(p[..., 1].abs(), p[..., 2].abs())
+        wall = torch.maximum(p[..., 0].abs() - 0.025, hole)
+        value = torch.minimum(p[..., 0].abs() - 0.005, wall)
+        return 0.02 * torch.tanh(value / 0.02) if squash else value
+
+    return Field(f, [0.2, 0.5, 0.5], lipschitz=1.0)
+
+
+def shot_at_the_pane(count):
+    """Rays through the wall and its pane, from one side, all of which must hit."""
+    generator = torch.Generator().manual_seed(4)
+    aim = 0.9 * (torch.rand(count, 2, generator=generator, dtype=torch.float64) - 0.5)
+    origin = torch.rand(count, 2, generator=generator, dtype=torch.float64) - 0.5
+    start = torch.cat([torch.full_like(aim[:, :1], -0.19), 0.9 * origin], -1)
+    end = torch.cat([torch.zeros_like(aim[:, :1]), aim], -1)
+    direction = torch.nn.functional.normalize(end - start, dim=-1)
+    return start, direction, (end - start).norm(dim=-1) + 0.01
+
+
+@pytest.mark.parametrize(
+    "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)], ids=["few", "a million"]
+)
+@pytest.mark.parametrize("squash", [False, True])
+def test_no_ray_goes_through_a_pane(count, squash):
+    shape = pane(squash)
+    made = bake(shape, 0.01)  # a grid as coarse as the pane is thin
+    rays = shot_at_the_pane(count)
+    hits = Intersector(shape, made).first_hits(*rays)
+    assert len(torch.unique(hits.ray)) == count
+
+
+@pytest.mark.parametrize(
+    "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)], ids=["few", "a million"]
+)
+@pytest.mark.parametrize("half", [0.025, 0.005, 0.0005])
+def test_no_ray_goes_through_a_sheet(count, half):
+    """A wall of 5 cm, a pane of 1 cm, a sheet of 1 mm: boxes answer in closed form."""
+    start, direction, _ = shot_at_the_pane(count)
+    enter, leave = Box([half, 0.5, 0.5]).interval(start, direction)
+    assert bool((leave > enter).all())
+    torch.testing.assert_close(enter, (-half - start[:, 0]) / direction[:, 0])
+
+
+def test_unknown_ways_are_refused(chair):
+    shape, made = chair
+    rays = around(shape, 5)
+    with pytest.raises(ValueError, match="certain, newton, mesh, grid"):
+        Intersector(shape, made).first_hits(*rays, "exact")
+    with pytest.raises(ValueError, match="certain, newton, mesh, grid"):
+        baked_roots(shape, made, *rays, "exact", FLOOR, 4, 6)
+    with pytest.raises(ValueError, match="certain, newton, mesh, grid"):
+        Quality(intersection="exact")
+
+
+def test_a_shape_is_baked_when_many_rays_have_met_it(monkeypatch):
+    monkeypatch.setattr(kept, "BAKE_AFTER", 1000)
+    monkeypatch.setattr(kept, "bake", lambda shape: bake(shape, 0.02))
+    shape = NeuralShape([[-0.3] * 3, [0.3] * 3], width=16, depth=3, skip=1, lipschitz=2.0)
+    shape.requires_grad_(False)
+    rays = around(shape, 900)
+    assert kept.baked_if_it_pays(shape, len(rays[0])) is None
+    shape.to_value.bias.add_(1e-3)  # another shape: it is counted anew
+    assert kept.baked_if_it_pays(shape, 999) is None
+    made = kept.baked_if_it_pays(shape, 1)
+    assert made is not None and kept.baked_if_it_pays(shape, 0) is made
+    plain = plain_march(shape, *rays, EVALUATE)
+    fast = march(shape, *rays, EVALUATE)
+    other, error = differences(plain, fast, len(rays[0]))
+    assert len(other) == 0 and float(error.max()) < 1e-8
