@@ -29,6 +29,12 @@ bench: .venv/.installed-dev
 	$(BIN)/python benchmarks/speed.py
 	$(BIN)/python benchmarks/stability.py
 	$(BIN)/python benchmarks/mechanisms.py
+	$(BIN)/python benchmarks/intersect.py --write-docs
+	$(BIN)/python benchmarks/solver.py --write-docs
+	$(BIN)/python benchmarks/maps.py --write-docs
+	$(BIN)/python benchmarks/objects.py --write-docs
+	$(BIN)/python benchmarks/dial.py
+	$(BIN)/python benchmarks/tradeoffs.py --write-docs
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .

@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rfsg.scene.scene import Node as Node
     from rfsg.scene.scene import Scene as Scene
     from rfsg.scene.scene import SceneError as SceneError
+    from rfsg.tracer.dial import simulate_within as simulate_within
     from rfsg.tracer.mimo import capacity as capacity
     from rfsg.tracer.mimo import mimo as mimo
     from rfsg.tracer.plan import Quality as Quality
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from rfsg.tracer.radiomap import radio_map_on as radio_map_on
     from rfsg.tracer.simulate import Result as Result
     from rfsg.tracer.simulate import simulate as simulate
+    from rfsg.tracer.tradeoff import tradeoff as tradeoff
 
 __version__ = "0.1.0"
 
@@ -70,6 +72,8 @@ _HOME = {
     "radio_map": "rfsg.tracer.radiomap",
     "radio_map_on": "rfsg.tracer.radiomap",
     "simulate": "rfsg.tracer.simulate",
+    "simulate_within": "rfsg.tracer.dial",
+    "tradeoff": "rfsg.tracer.tradeoff",
 }
 
 __all__ = [
@@ -92,6 +96,8 @@ __all__ = [
     "radio_map",
     "radio_map_on",
     "simulate",
+    "simulate_within",
+    "tradeoff",
 ]
 
 

@@ -15,10 +15,12 @@ from rfsg.cli.fit_regions import fit_regions
 from rfsg.cli.map import map_
 from rfsg.cli.simulate import simulate
 from rfsg.cli.terminal import say
+from rfsg.cli.tradeoff import tradeoff
 
 COMMANDS: dict[str, Callable[..., None]] = {  # in the order of --help
     "simulate": simulate,
     "map": map_,
+    "tradeoff": tradeoff,
     "check": check,
     "info": info,
     "learn-shape": learn_shape,

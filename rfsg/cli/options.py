@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rfsg.cli.parse import parse_frequency
+from rfsg.cli.parse import parse_budget, parse_decibel, parse_frequency
 
 HERTZ = "NUMBER[Hz|kHz|MHz|GHz]"
 
@@ -48,6 +48,23 @@ Preset = Annotated[str, typer.Option("--quality", help="draft, standard or refer
 Changes = Annotated[
     list[str],
     typer.Option("--set", metavar="FIELD=VALUE", help="Change one field of the quality: depth=2."),
+]
+Accuracy = Annotated[
+    float | None,
+    typer.Option(
+        parser=parse_decibel,
+        metavar="NUMBER[dB]",
+        help="Of path gain, at 90 % of links against reference. Takes the cheapest setting that is "
+        "estimated to meet it.",
+    ),
+]
+Budget = Annotated[
+    float | None,
+    typer.Option(
+        parser=parse_budget,
+        metavar="NUMBER[s|min|h]",
+        help="Time to spend. Takes the most accurate setting that is predicted to fit.",
+    ),
 ]
 Moves = Annotated[
     list[str],

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 UNITS = {"hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9, "thz": 1e12}
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SPANS = SECONDS | {"min": 60.0, "h": 3600.0}  # of work; nothing in a channel takes a minute
 HIGHEST_CREDIBLE_HZ = 1e15  # above this a unit was surely mistaken (ultraviolet light)
 MOST_FREQUENCIES = 10_000  # each is a whole evaluation of all paths
 
@@ -40,6 +41,22 @@ def parse_duration(text: str) -> float:
     value = _quantity(text, SECONDS)
     if not 0.0 < value < math.inf:
         raise typer.BadParameter(f"{text!r} is not a duration; write for example 10ms")
+    return value
+
+
+def parse_budget(text: str) -> float:
+    """'2s', '5min' or '1.5h' in seconds."""
+    value = _quantity(text, SPANS)
+    if not 0.0 < value < math.inf:
+        raise typer.BadParameter(f"{text!r} is not a time; write for example 5min")
+    return value
+
+
+def parse_decibel(text: str) -> float:
+    """'1dB', '0.5 dB' or '1' in decibels, above 0."""
+    value = _quantity(text, {"db": 1.0})
+    if not 0.0 < value < math.inf:
+        raise typer.BadParameter(f"{text!r} is not an accuracy; write for example 1dB")
     return value
 
 

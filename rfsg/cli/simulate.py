@@ -7,6 +7,8 @@ import typer
 
 from rfsg.cli.options import (
     HERTZ,
+    Accuracy,
+    Budget,
     Changes,
     Device,
     Frequencies,
@@ -46,6 +48,8 @@ def simulate(
     frequency: Frequencies = [],
     quality: Preset = "standard",
     changes: Changes = [],
+    accuracy: Accuracy = None,
+    budget: Budget = None,
     move: Moves = [],
     replace: Replacements = [],
     without: Removals = [],
@@ -88,6 +92,8 @@ def simulate(
 
     Writes links.csv, paths.csv, channel.npz, report.json, scene.png and pdp.png into --out.
 
+    --accuracy or --budget take the place of --quality: the setting is chosen by pilot runs.
+
     Example: rfsg simulate lab.usda --frequency 2.44GHz --move /World/Cabinet=1.2,0,0 --out moved
     """
     from rfsg import report
@@ -96,6 +102,10 @@ def simulate(
         raise typer.BadParameter("--subcarriers divides a band: give --bandwidth as well")
     if (snapshots is None) != (duration is None):
         raise typer.BadParameter("--snapshots and --duration: give both or neither")
+    if (accuracy or budget) and (quality != "standard" or changes):
+        raise typer.BadParameter(
+            "--accuracy and --budget choose the quality: leave out --quality, --set"
+        )
     question, carriers = parse_quality(quality, changes), parse_frequencies(frequency)
     report.refuse_taken(out, overwrite)
     edited = edit(read_scene(scene, asset_root, variant, time), move, replace, without, receivers)
@@ -106,9 +116,14 @@ def simulate(
     torch.manual_seed(seed)
     hertz = torch.tensor(carriers, dtype=torch.float64) if carriers else None
     with bar() as progress:
-        result = tracer.simulate(
-            edited, hertz, question, device=device_named(device), progress=progress
-        )
+        options: dict[str, Any] = {"device": device_named(device), "progress": progress}
+        if accuracy is None and budget is None:
+            result, choice = tracer.simulate(edited, hertz, question, **options), None
+        else:
+            from rfsg.tracer.dial import within
+
+            wanted = {"accuracy_db": accuracy, "budget_s": budget, "seed": seed}
+            result, choice = within(edited, hertz, **wanted, **options)
         progress("responses")
         band = {} if subcarriers is None else {"subcarriers": subcarriers}
         responses = report.response_arrays(
@@ -117,6 +132,7 @@ def simulate(
     asked = asked_of_scene(scene, move, replace, without, asset_root, variant, time)
     asked |= {"seed": seed, "device": device, "receivers_file": receivers and str(receivers)}
     asked |= {"bandwidth_hz": bandwidth, "snapshots": snapshots, "duration_s": duration, **band}
+    asked |= {} if choice is None else {"dial": choice}
     chosen = _chosen_links(edited, result, link)
     with report.output_folder(out, overwrite) as folder:
         report.write_links(result, folder / "links.csv")
@@ -127,6 +143,8 @@ def simulate(
     _print_links(result)
     from rfsg.tracer.mimo import plane_wave_warnings
 
+    if choice is not None:
+        typer.echo(choice.sentence())
     for warning in (*result.warnings, *plane_wave_warnings(result)):
         note(warning)
     print_files(out, ("links.csv", "paths.csv", "channel.npz", "report.json"))

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from rfsg.objects.body import Body
 from rfsg.objects.catalogue import shape_class, surface_class
 from rfsg.objects.shapes.presence import absence
+from rfsg.scene.files import outer_file
 from rfsg.scene.scene import SceneError
 
 FORMAT_VERSION = 1
@@ -49,8 +50,9 @@ def pack(body: Body) -> bytes:
     return save_tensors(tensors, metadata={"rfsg": json.dumps(head, sort_keys=True)})
 
 
-def unpack(data: bytes, where: str) -> Body:
-    """The body in safetensors bytes. ``where`` begins each fault.
+def unpack(data: bytes, where: str, file: str | None = None) -> Body:
+    """The body in safetensors bytes. ``where`` begins each fault; ``file`` is where they came from,
+    beside which a learned shape may keep what it is baked to.
 
     Raises SceneError with every fault found: header, version, kinds, declared sizes, and names,
     shapes, dtypes and finiteness of the tensors against the declared architecture, and whether a
@@ -78,6 +80,8 @@ def unpack(data: bytes, where: str) -> Body:
         faults.append(f"{where}: the {parts['shape'].kind} shape {why}")
     if faults:
         raise SceneError(faults)
+    if file is not None and parts["shape"].kind == "neural":
+        parts["shape"].folder = os.path.dirname(outer_file(file))
     return Body(parts["shape"], parts["surface"])
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Contact, Crossing
+from rfsg.objects.shapes.kept import BAKE_AFTER
 from rfsg.scene.world import World
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.march import MarchOptions, crossings
@@ -89,11 +90,13 @@ def search(
     """
     report = SearchReport()
     depth = quality.depth if len(world) else 0
+    # one curved face in a sequence can be enumerated, several only where there are none
+    few = quality.curved < 2 or all(n.body.shape.faceted for n in world.scene.nodes)
     parts = [_direct(len(tx_position), len(rx_position), depth, world.device)]
-    if depth and quality.search != "rays" and (quality.curved < 2 or quality.search == "enumerate"):
+    if depth and quality.search != "rays" and (few or quality.search == "enumerate"):
         try:
             parts.append(enumerate_chains(world, tx_position, rx_position, quality))
-            report.complete = quality.curved < 2
+            report.complete = few
         except TooMany:
             if quality.search == "enumerate":
                 raise ValueError(
@@ -170,9 +173,15 @@ def join(parts: list[Tubes]) -> Tubes:
     return Tubes(rays, *(torch.cat([getattr(p, n) for p in parts]) for n in names))
 
 
-def search_options(quality: Quality) -> MarchOptions:
-    """How a search marches: a tenth of the paper's epsilon as the least step, sign changes only."""
-    return MarchOptions(step_floor=0.1 * quality.epsilon, chunk=quality.chunk)
+def search_options(quality: Quality, rays: int) -> MarchOptions:
+    """How a search of so many rays marches: a tenth of the paper's epsilon as the least step, sign
+    changes only. A way other than the certain one needs baked shapes, however few the rays."""
+    return MarchOptions(
+        step_floor=0.1 * quality.epsilon,
+        chunk=quality.chunk,
+        rays=rays if quality.intersection == "certain" else max(rays, BAKE_AFTER),
+        intersection=quality.intersection,
+    )
 
 
 def _bounce_chunk(
@@ -184,7 +193,7 @@ def _bounce_chunk(
     report: SearchReport,
 ) -> Tubes:
     spans = proxies.spans(tubes.rays)
-    inside = crossings(world, tubes.rays, spans, search_options(quality))
+    inside = crossings(world, tubes.rays, spans, search_options(quality, quality.rays))
     before = amplitude_before(world, tubes.rays, inside, frequency)
     report.hits += len(inside.ray)
     entered = (inside.enter > 0) & (inside.normal_enter.abs().sum(-1) > 0)

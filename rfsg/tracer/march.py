@@ -29,12 +29,14 @@ FORWARD = ASIDE  # no direction of a drawing is at right angles to it
 class MarchOptions:
     """step_floor: least step [m], so the thinnest thing sure to be seen. dtype: float32 to search,
     float64 to evaluate. polish: bisection-safe secant steps on a bracket. chunk: spans at a time.
-    intersection: how a learned shape is met once it is baked, one of ``intersect.WAYS``."""
+    rays: how many the question launches in all; for many a learned shape is baked first (``kept``).
+    intersection: how a baked shape is met, one of ``intersect.WAYS``."""
 
     step_floor: float = 2e-3
     dtype: torch.dtype = torch.float32
     polish: int = 6
     chunk: int = 65_536
+    rays: int = 0
     intersection: str = "certain"
 
 
@@ -174,7 +176,7 @@ def march(
     own = getattr(shape, "stretches", None)
     if own is not None and not shape.convex:
         return own(start, direction, length)
-    baked = baked_if_it_pays(shape, len(start))
+    baked = baked_if_it_pays(shape, options.rays)
     if baked is None:
         return plain_march(shape, start, direction, length, options)
     p0, d, end = (x.to(options.dtype) for x in (start, direction, length))

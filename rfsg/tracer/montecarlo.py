@@ -141,7 +141,7 @@ def _fly(
     generator: torch.Generator,
 ) -> tuple[Flight, tuple[Rays, Tensor, Tensor] | None]:
     """One level of rays, and those that they send on. fresh: rays that have not scattered yet."""
-    inside = crossings(world, rays, proxies.spans(rays), search_options(quality))
+    inside = crossings(world, rays, proxies.spans(rays), search_options(quality, quality.map_rays))
     m = len(inside.ray)
     every = torch.arange(m, device=world.device)
     t = scalar(transmission_of(world, rays, inside, every, frequency))[:, 0].abs() ** 2

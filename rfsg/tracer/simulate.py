@@ -91,6 +91,8 @@ def simulate(
     frequency: float | Tensor | None = None,
     quality: str | Quality = "standard",
     *,
+    accuracy_db: float | None = None,
+    budget_s: float | None = None,
     gradients: bool = False,
     chains: Chains | None = None,
     device: torch.device | str = "cpu",
@@ -99,10 +101,25 @@ def simulate(
     """Exact paths and the channel between all transmitters and receivers of a scene.
 
     frequency: [Hz], one or several [f]; None takes the transmitters' or the scene's own.
-    gradients: keep the graph, so that ``result.channel`` differentiates with respect to poses, radio
-    positions, shapes, materials and weights that require it. chains: candidates kept from an earlier
-    result (the search is skipped). Raises SceneError without a frequency or with broken radios.
+    accuracy_db, budget_s: choose the setting by pilot runs, in place of ``quality``: the cheapest that
+    is accurate enough, the most accurate within the time (``dial.within``). gradients: keep the graph,
+    so that ``result.channel`` differentiates with respect to poses, radio positions, shapes, materials
+    and weights that require it. chains: candidates kept from an earlier result (the search is skipped).
+    Raises SceneError without a frequency or with broken radios.
     """
+    if accuracy_db is not None or budget_s is not None:
+        from rfsg.tracer.dial import simulate_within  # which simulates, too
+
+        return simulate_within(
+            scene,
+            frequency,
+            accuracy_db=accuracy_db,
+            budget_s=budget_s,
+            gradients=gradients,
+            chains=chains,
+            device=device,
+            progress=progress,
+        )
     quality = Quality.named(quality) if isinstance(quality, str) else quality
     frequencies = resolve_frequency(scene, frequency).to(device)
     tx, rx = (positions(r, device) for r in (scene.transmitters, scene.receivers))

@@ -223,18 +223,21 @@ def test_unknown_ways_are_refused(chair):
         Quality(intersection="exact")
 
 
-def test_a_shape_is_baked_when_many_rays_have_met_it(monkeypatch):
+def test_a_shape_is_baked_for_a_question_of_many_rays(monkeypatch, tmp_path):
     monkeypatch.setattr(kept, "BAKE_AFTER", 1000)
-    monkeypatch.setattr(kept, "bake", lambda shape: bake(shape, 0.02))
+    monkeypatch.setattr(kept, "bake", lambda shape, step: bake(shape, 0.02))
     shape = NeuralShape([[-0.3] * 3, [0.3] * 3], width=16, depth=3, skip=1, lipschitz=2.0)
     shape.requires_grad_(False)
     rays = around(shape, 900)
-    assert kept.baked_if_it_pays(shape, len(rays[0])) is None
-    shape.to_value.bias.add_(1e-3)  # another shape: it is counted anew
-    assert kept.baked_if_it_pays(shape, 999) is None
-    made = kept.baked_if_it_pays(shape, 1)
-    assert made is not None and kept.baked_if_it_pays(shape, 0) is made
+    shape.folder = str(tmp_path)
+    assert kept.baked_if_it_pays(shape, 999) is None and kept.baked_if_it_pays(shape, 999) is None
+    made = kept.baked_if_it_pays(shape, 1000)
+    assert made is not None and kept.baked_if_it_pays(shape, 5000) is made
+    assert kept.baked_if_it_pays(shape, 999) is None  # whatever was asked before
+    assert len(list(tmp_path.glob("*.baked.safetensors"))) == 1
+    shape.to_value.bias.add_(1e-3)  # another shape
+    assert kept.baked_if_it_pays(shape, 1000) is not made
     plain = plain_march(shape, *rays, EVALUATE)
-    fast = march(shape, *rays, EVALUATE)
+    fast = march(shape, *rays, replace(EVALUATE, rays=1000))
     other, error = differences(plain, fast, len(rays[0]))
     assert len(other) == 0 and float(error.max()) < 1e-8

@@ -22,7 +22,7 @@ MOST_KEPT = 16
 MAX_BYTES = 512 * 2**20  # of a file: ten times what a 2 m object takes at 5 mm
 MAX_HEADER_BYTES = 2**16
 ENDING = ".baked.safetensors"
-BAKE_AFTER = 100_000  # rays marched on one state of a shape before baking it pays
+BAKE_AFTER = 50_000  # rays that a question launches before baking its shapes pays
 
 _NUMBERS = ("step", "margin", "level", "slope", "lipschitz")
 # name: (dtype, number of dimensions)
@@ -43,7 +43,6 @@ _TENSORS = {
 @dataclass
 class _Kept:
     state: object
-    rays: int = 0
     baked: Baked | None = None
     refused: bool = False
 
@@ -81,18 +80,18 @@ def baked(shape: Shape, folder: str | Path | None = None, step: float | None = N
 
 
 def baked_if_it_pays(shape: Shape, rays: int) -> Baked | None:
-    """The shape, baked, once so many rays have been marched through it as baking costs; else None.
+    """The shape, baked, for a question that launches so many ``rays`` that baking pays; else None.
 
-    So a fit, which changes the shape at each step, and a scene of a few links never wait for it. Only
-    networks on the CPU are baked; one without a surface is not.
+    Only the question decides, not what was asked before: the same question has the same answer, to
+    the bit. Only networks on the CPU are baked; one without a surface is not.
     """
-    if shape.kind != "neural" or shape.bounds().device.type != "cpu":
+    if rays < BAKE_AFTER or shape.kind != "neural" or shape.bounds().device.type != "cpu":
         return None
     kept = _of(shape)
-    kept.rays += rays
-    if kept.baked is None and kept.rays >= BAKE_AFTER and not kept.refused:
+    if kept.baked is None and not kept.refused:
         try:
-            kept.baked = bake(shape)
+            learning = any(p.requires_grad for p in getattr(shape, "parameters", list)())
+            kept.baked = baked(shape, None if learning else getattr(shape, "folder", None))
         except ValueError:  # no surface on its grid: the plain march looks closer
             kept.refused = True
     return kept.baked

@@ -43,6 +43,7 @@ class NeuralShape(nn.Module):
     convex = False
     faceted = False
     exact = False
+    folder: str | None = None  # that of the file it was read from
     _bounds: Tensor
     _centre: Tensor
     _reach: Tensor

@@ -72,7 +72,7 @@ def read_asset(path: Path) -> AssetRecord:
         raise SceneError([f"{where}: rfsg:neural:provenance is not JSON: {error}"]) from error
     beside = Path(resolved).parent == Path(os.path.realpath(path)).parent
     portable = beside and not any(layer.GetCompositionAssetDependencies())
-    body = unpack(data, f"{path}: {given}")
+    body = unpack(data, f"{path}: {given}", resolved)
     return AssetRecord(body, provenance, resolved, digest(data), referable, portable)
 
 

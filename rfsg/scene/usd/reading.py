@@ -275,7 +275,7 @@ class _Reader:
         key = (resolved, prim.GetAttribute("rfsg:neural:sha256").Get())
         if key not in self.weights:
             data = weights_bytes(prim, resolved, given, where)
-            self.weights[key] = unpack(data, f"{where}: {given}")
+            self.weights[key] = unpack(data, f"{where}: {given}", resolved)
         return self.weights[key]
 
     def _gprim(self, prim: Usd.Prim) -> None:
