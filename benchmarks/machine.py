@@ -20,6 +20,15 @@ def measured_on(seconds: float) -> str:
     )
 
 
+def write_section(page: Path, heading: str, *parts: str) -> None:
+    """Put a section in the place of the one of its heading ("## ..."), or last."""
+    text = page.read_text() if page.is_file() else ""
+    before, found, rest = f"\n{text}".partition(f"\n{heading}\n")
+    _, mark, after = rest.partition("\n## ") if found else ("", "", "")
+    following = f"## {after}" if mark else ""
+    write_page(page, before.strip(), "", heading, "", "\n".join(parts).strip(), "", following)
+
+
 def write_page(page: Path, *parts: str) -> None:
     """Parts of a page, a blank line between; written beside, then renamed."""
     beside = page.with_name(page.name + ".part")

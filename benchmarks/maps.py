@@ -1,6 +1,6 @@
 """Radio maps: how fast, how exact, how much memory? Against the exact sum, and a peer where there is one.
 
-    python benchmarks/maps.py [--runs 5] [--threads 2] [--rays N] [--memory]
+    python benchmarks/maps.py [--runs 5] [--threads 2] [--rays N] [--memory] [--write-docs]
 
 The street canyon of ``peers/cases.py``: 180 x 120 cells of 1 m, 3 reflections, 3.5 GHz. The truth is
 the path solver's incoherent sum at cells' middles (``method="paths"``), at 400 of them, drawn once.
@@ -26,6 +26,17 @@ PEER = HERE / "peers" / ".venv" / "bin" / "python"
 SIZE, HEIGHT, CELL = (180.0, 120.0), 1.5, 1.0  # [m]
 CASE = "canyon 3.5 GHz"
 DRAWN = 400  # cells of the truth
+PAGE = HERE.parent / "docs" / "performance.md"
+SAID = {
+    "## A radio map of a street": """
+Written by `python benchmarks/maps.py --write-docs`: 180 x 120 cells of 1 m, 3 reflections, against the
+exact incoherent sum at the middles of 400 cells. The ways take turns.
+""",
+    "## Memory of a map of a million cells": """
+Written by `python benchmarks/maps.py --memory --write-docs`: the same street in cells of 0.147 m, each
+method in a process of its own. The goal was 2 GB.
+""",
+}
 WORK = HERE.parent / "out" / "maps"
 
 
@@ -108,7 +119,7 @@ class Server:
         self.process.wait()
 
 
-def compare(runs: int, threads: int, rays: int) -> None:
+def compare(runs: int, threads: int, rays: int) -> list[str]:
     """Prints the table."""
     import numpy as np
 
@@ -132,7 +143,7 @@ def compare(runs: int, threads: int, rays: int) -> None:
     truth, drawn = _truth()
     head = ("way", "first [s]", "then [s]", "processor [s]", "median error [dB]")
     head = (*head, "95 % within [dB]", "wrongly lit or dark")
-    print(_row(head), _row(("---",) * len(head)), sep="\n")
+    lines = [_row(head), _row(("---",) * len(head))]
     for name, (first, *rest) in times.items():
         gain = np.load(ways[name][1].split()[-1]).reshape(-1)[drawn].astype(float)
         both = (gain > 0) & (truth > 0)
@@ -140,7 +151,11 @@ def compare(runs: int, threads: int, rays: int) -> None:
         wrong = int(((gain > 0) != (truth > 0)).sum())
         wall, processor = (_spread(x) for x in zip(*rest, strict=True))
         error = f"{np.median(off):.2g}", f"{np.quantile(np.abs(off), 0.95):.2g}"
-        print(_row((name, f"{first[0]:.3g}", wall, processor, *error, f"{wrong} of {len(drawn)}")))
+        lines.append(
+            _row((name, f"{first[0]:.3g}", wall, processor, *error, f"{wrong} of {len(drawn)}"))
+        )
+    print(*lines, sep="\n")
+    return lines
 
 
 def _row(cells: tuple[str, ...]) -> str:
@@ -175,16 +190,21 @@ def _truth():  # noqa: ANN202
 # memory
 
 
-def memory() -> None:
-    """Peak memory of a map of a million cells, each method in a process of its own."""
-    print("| method | cells | s | peak memory [MiB] | before the map [MiB] |")
-    print("| --- | --- | --- | --- | --- |")
+def memory() -> list[str]:
+    """Peak memory of a map of a million cells, each method in a process of its own: a table."""
+    lines = [
+        "| method | cells | s | peak memory [MiB] | before the map [MiB] |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    print(*lines, sep="\n")
     for method in ("rays", "images", "paths"):
         done = subprocess.run(
             [sys.executable, __file__, "--serve", f"peak-{method}"], stdout=subprocess.PIPE,
             text=True, check=True, env=os.environ | {"PYTHONPATH": str(HERE.parent)},
         )  # fmt: skip
-        print(done.stdout.strip(), flush=True)
+        lines.append(done.stdout.strip())
+        print(lines[-1], flush=True)
+    return lines
 
 
 def peak(method: str) -> None:
@@ -214,6 +234,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rays", type=int, default=0, help="rfsg's rays as well: so many")
     parser.add_argument("--memory", action="store_true", help="a million cells: peak memory")
+    parser.add_argument("--write-docs", action="store_true", help=f"a section of {PAGE.name}")
     parser.add_argument("--serve", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.serve == "sionna":
@@ -222,10 +243,20 @@ def main() -> None:
         serve_rfsg()
     elif options.serve:
         peak(options.serve.removeprefix("peak-"))
-    elif options.memory:
-        memory()
     else:
-        compare(options.runs, options.threads, options.rays)
+        start = time.perf_counter()
+        if options.memory:
+            heading, lines = "## Memory of a map of a million cells", memory()
+        else:
+            heading = "## A radio map of a street"
+            lines = compare(options.runs, options.threads, options.rays)
+        if options.write_docs:
+            import torch
+            from machine import measured_on, write_section
+
+            torch.set_num_threads(options.threads)
+            seconds = time.perf_counter() - start
+            write_section(PAGE, heading, SAID[heading], "", *lines, "", measured_on(seconds))
 
 
 if __name__ == "__main__":

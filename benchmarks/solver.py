@@ -1,7 +1,7 @@
 """The path solver on scenes of flat faces, beside Sionna RT where it is installed.
 
     make -C benchmarks/peers venv        # once, for the peer; without it rfsg is measured alone
-    python benchmarks/solver.py [--rounds 3] [--threads 2] [JOB ...]
+    python benchmarks/solver.py [--rounds 3] [--threads 2] [--write-docs] [JOB ...]
 
 Every job runs in a process of its own, the two sides in turn; a process answers once (the first call)
 and then twice more (steady). ``process``: from its start to its first answer, scene and imports
@@ -29,6 +29,12 @@ sys.path.insert(0, str(HERE))
 
 import cases  # noqa: E402
 
+PAGE = HERE.parents[1] / "docs" / "performance.md"
+SAID = """
+Written by `python benchmarks/solver.py --write-docs`: a transmitter in an empty room of six concrete
+slabs, or in a street canyon, and so many receivers at random; paths against the exhaustive image method.
+Both sides run in turn, each job in a process of its own. *process* is from its start to its first answer.
+"""
 STEADY = 2  # calls after the first
 RECEIVERS = (10, 100, 1_000, 10_000)
 
@@ -182,12 +188,14 @@ def row(name: str, side: str, rounds: list[dict], there_are: int) -> str:
     )
 
 
-def compare(names: list[str], rounds: int, threads: int) -> None:
+def compare(names: list[str], rounds: int, threads: int) -> list[str]:
+    """A table's lines, each printed as soon as it is there."""
     sides = ["rfsg", "sionna"] if PEER.exists() else ["rfsg"]
-    print(
-        "| job | side | steady [s] | CPU [s] | first call [s] | process [s] | paths | peak [GiB] |"
-    )
-    print("|---|---|---|---|---|---|---|---|")
+    lines = [
+        "| job | side | steady [s] | CPU [s] | first call [s] | process [s] | paths | peak [GiB] |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    print(*lines, sep="\n")
     for name in names:
         mine = sides[:1] if name in ALONE else sides
         found: dict[str, list[dict]] = {side: [] for side in mine}
@@ -196,7 +204,9 @@ def compare(names: list[str], rounds: int, threads: int) -> None:
                 found[side].append(measured(side, name, threads))
         there_are = exhaustive(name)
         for side in mine:
-            print(row(name, side, found[side], there_are), flush=True)
+            lines.append(row(name, side, found[side], there_are))
+            print(lines[-1], flush=True)
+    return lines
 
 
 def main() -> None:
@@ -204,6 +214,7 @@ def main() -> None:
     parser.add_argument("jobs", nargs="*", metavar="JOB", help=f"of {', '.join(JOBS)}")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--write-docs", action="store_true", help=f"a section of {PAGE.name}")
     parser.add_argument("--side", choices=("rfsg", "sionna"), help=argparse.SUPPRESS)
     parser.add_argument("--calls", type=int, default=1, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -214,7 +225,15 @@ def main() -> None:
     if options.side:
         one_side(options.side, names[0], options.calls)
     else:
-        compare(names, options.rounds, options.threads)
+        start = time.perf_counter()
+        lines = compare(names, options.rounds, options.threads)
+        if options.write_docs:
+            import torch  # not in the peer's environment
+            from machine import measured_on, write_section
+
+            torch.set_num_threads(options.threads)
+            seconds = time.perf_counter() - start
+            write_section(PAGE, "## The path solver", SAID, "", *lines, "", measured_on(seconds))
 
 
 if __name__ == "__main__":

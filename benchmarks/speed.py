@@ -19,6 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
+from machine import ROOT, write_page
 from torch import Tensor
 
 from rfsg.objects.shapes.neural import NeuralShape
@@ -33,10 +34,10 @@ from rfsg.tracer.radiomap import radio_map
 from rfsg.tracer.records import Rays
 from rfsg.tracer.simulate import simulate
 
-ROOT = Path(__file__).resolve().parents[1]
 SCENE = ROOT / "assets" / "scenes" / "lab.usda"
 CABINET = ROOT / "assets" / "objects" / "cabinet" / "cabinet.usda"
 PAGE = ROOT / "docs" / "performance.md"
+OTHERS = "<!-- the sections below are written by the scripts that they name -->\n"
 RAYS = 100_000
 POINTS = 20_000  # asked of a network at once: in float64 with slopes some 4 GiB
 HITTING = 0.5  # share of the marched rays that are aimed to hit
@@ -306,10 +307,8 @@ def main() -> None:
         "",
     ]
     tail = [f"Peak memory of the whole run: {peak_memory():.0f} MiB.", ""]
-    beside = options.out.with_name(options.out.name + ".part")
-    beside.write_text("\n".join([*head, *_machine(runs), *page.lines, *tail]))
-    beside.replace(options.out)
-    print(f"written: {options.out}")
+    kept = options.out.read_text().partition(OTHERS)[2] if options.out.is_file() else ""
+    write_page(options.out, *head, *_machine(runs), *page.lines, *tail, OTHERS + kept)
 
 
 if __name__ == "__main__":
