@@ -1,7 +1,8 @@
 """Marching a learned shape on what was baked of it: the network is asked only next to the surface.
 
 The steps are those of the plain march, |f| / L and not below the floor, but |f| is first bounded from
-the baked grid: where its value exceeds its doubt the sign is known, and the bound is what is left.
+the baked grid: where its value exceeds its doubt the sign is known, and the bound is what is left. A
+cell at whose two ends, on the ray, it does so by more than the values bend between is crossed at once.
 Elsewhere, a fraction of a millimetre from the surface, the network answers.
 """
 
@@ -47,19 +48,20 @@ def bracketed(
     """The first ``most`` sign changes on each ray, 0 <= t <= end [m], searched in float32."""
     start, direction, end = start.float(), direction.float(), end.float()
     count = torch.zeros(len(end), dtype=torch.int64, device=end.device)
-    value, bound = signed(shape, baked, start)
+    value, bound, way = signed(shape, baked, start, direction)
     inside = value < 0
     found: list[tuple[Tensor, ...]] = []
     row = torch.nonzero(end > 0).squeeze(-1)
-    state = _take((start, direction, end, torch.zeros_like(end), value, bound), row)
+    state = _take((start, direction, end, torch.zeros_like(end), value, bound, way), row)
     while len(row):
-        p0, d, last, t, value, bound = state
-        first = t + _step(baked, bound).clamp_(min=floor)
+        p0, d, last, t, value, bound, way = state
+        first = t + torch.maximum(_step(baked, bound), way).clamp_(min=floor)
         more = min(max(AT_ONCE // len(row), 1), MOST_AHEAD)
         along = first[:, None] + floor * torch.arange(more, device=t.device)
         along = torch.minimum(along, last[:, None])
         point = torch.addcmul(p0[:, None], along[..., None], d[:, None])
-        ahead, bounds = (x.view(along.shape) for x in signed(shape, baked, point.view(-1, 3)))
+        looked = signed(shape, baked, point.view(-1, 3), d.repeat_interleave(more, 0))
+        ahead, bounds, ways = (x.view(along.shape) for x in looked)
         t, value = torch.cat([t[:, None], along], 1), torch.cat([value[:, None], ahead], 1)
         flip = (value[:, 1:] < 0) != (value[:, :-1] < 0)
         i, k = torch.nonzero(flip, as_tuple=True)
@@ -70,7 +72,7 @@ def bracketed(
             count[row] = (count[row] + flip.sum(1)).clamp_(max=most)
         going = (t[:, -1] < last) & (count[row] < most)
         last = torch.where(going, last, t[:, -1])  # a ray that is done rests where it is
-        state = (p0, d, last, t[:, -1], value[:, -1], bounds[:, -1])
+        state = (p0, d, last, t[:, -1], value[:, -1], bounds[:, -1], ways[:, -1])
         moving = torch.nonzero(going).squeeze(-1)
         if len(moving) <= RESTING * len(row):
             row, state = row[moving], _take(state, moving)
@@ -82,16 +84,17 @@ def bracketed(
 
 
 def signed(
-    shape: Shape, baked: Baked, point: Float[Tensor, "m 3"]
-) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """(value, bound): f or about it, never of the wrong sign, and a lower bound of |f| [m]."""
-    value, doubt = baked.look(point)
+    shape: Shape, baked: Baked, point: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"]
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """(value, bound, way): f or about it, never of the wrong sign, a lower bound of |f| [m], and how far
+    the baked values say that it keeps its sign along the direction [m]."""
+    value, doubt, way = baked.look_ahead(point, direction)
     bound = value.abs() - doubt
     near = torch.nonzero(bound <= 0).squeeze(-1)
     if len(near):
         exact = shape.sdf(point[near])
         value[near], bound[near] = exact, exact.abs()
-    return value, bound
+    return value, bound, way
 
 
 def _step(baked: Baked, bound: Tensor) -> Tensor:

@@ -9,8 +9,10 @@ mesh: the zero mesh alone.  grid: a march on the baked values alone.
 Each but ``certain`` is as wrong as ``benchmarks/intersect.py`` finds it to be.
 """
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,7 +28,8 @@ from rfsg.tracer.triangles import Triangles
 
 Answer = tuple["Hits", tuple[Tensor, ...]]
 WAYS = INTERSECTIONS
-CHUNK = 262_144  # rays at a time: a few MB of state
+CHUNK = 65_536  # rays at a time: a few MB of state, and a share of a thread's work
+LEAST_LATE = 2_048  # rays of a thread's share of the march: fewer cost more in calls than in work
 FLOOR = 5e-4  # [m] least step of the march of rays that fail a check
 TOLERANCE = 5e-5  # [m]
 SHORT_STEP = 1e-3  # [m] longest step from the mesh to the root
@@ -125,19 +128,23 @@ class Intersector:
         if way not in WAYS:
             raise ValueError(f"intersection {way!r}: expected one of {', '.join(WAYS)}")
         work = getattr(self, "_" + way)
-        parts: list[Hits] = []
-        late: list[tuple[Tensor, ...]] = []
-        for begin in range(0, len(length), CHUNK):
+
+        def one(begin: int) -> Answer:
             piece = slice(begin, begin + CHUNK)
             o, d, end = origin[piece].float(), direction[piece].float(), length[piece].float()
             hits, (ray, *rest) = work(o, d, end)
-            parts.append(Hits(hits.ray + begin, hits.t, hits.normal))
-            late.append((ray + begin, *rest))
-        if late:  # rays that need a march go together: each of its steps costs some calls
-            parts.append(self._marched(*(torch.cat(column) for column in zip(*late, strict=True))))
-        if not parts:
+            return Hits(hits.ray + begin, hits.t, hits.normal), (ray + begin, *rest)
+
+        answers = in_threads(one, range(0, len(length), CHUNK))
+        if not answers:
             none = origin.new_zeros(0)
             return Hits(none.long(), none, origin.new_zeros(0, 3))
+        # rays that need a march go together: each of its steps costs some calls
+        late = [torch.cat(column) for column in zip(*(rest for _, rest in answers), strict=True)]
+        shares = max(min(torch.get_num_threads(), len(late[0]) // LEAST_LATE), 1)
+        split = zip(*(torch.tensor_split(column, shares) for column in late), strict=True)
+        parts = [hits for hits, _ in answers]
+        parts += in_threads(lambda share: self._marched(*share), list(split))
         return Hits(*(torch.cat([getattr(h, n) for h in parts]) for n in ("ray", "t", "normal")))
 
     # the ways
@@ -265,6 +272,20 @@ class Intersector:
         sides = [h * e for e in torch.eye(3)]
         slopes = [self.baked.look(point + e)[0] - self.baked.look(point - e)[0] for e in sides]
         return F.normalize(torch.stack(slopes, -1), dim=-1)
+
+
+def in_threads(work: Callable[[Any], Any], pieces: Sequence[Any]) -> list[Any]:
+    """What ``work`` makes of each piece, several at a time, each with one thread of torch: its threads
+    meet after each operation, which costs more than operations on a few thousand rays."""
+    threads = torch.get_num_threads()
+    if min(threads, len(pieces)) < 2:
+        return [work(piece) for piece in pieces]
+    torch.set_num_threads(1)  # of this thread, and of those begun from now on
+    try:
+        with ThreadPoolExecutor(min(threads, len(pieces))) as pool:
+            return list(pool.map(torch.no_grad()(work), pieces))
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _none(o: Tensor) -> tuple[Tensor, ...]:

@@ -1,13 +1,16 @@
 """What rays ask of a baked shape (see ``baked``): its meshes, and values near its surface."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 BLOCK = 4  # cells per side of a coarse block: one value decides about 64 cells
+BEYOND = 1e-6  # [m] past a cell's end, so that rounding leaves no ray on it
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,17 @@ class Baked:
 
     def look(self, point: Float[Tensor, "m 3"]) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
         """(value, doubt): |f - value| <= doubt [m] at points within the bounds, in float32."""
+        value, doubt, _ = self._look(point, None)
+        return value, doubt
+
+    def look_ahead(
+        self, point: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"]
+    ) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
+        """The same, and how far [m] f certainly keeps its sign along unit directions: to the end of the
+        point's cell, or 0 where that is not known."""
+        return self._look(point, direction)
+
+    def _look(self, point: Tensor, direction: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
         place = (point.float() - self.low).div_(self.step)
         x, y, z = place.unbind(-1)
         counts = self.block.shape
@@ -54,31 +68,83 @@ class Baked:
         ]
         flat = (home[0] * counts[1] + home[1]).mul_(counts[2]).add_(home[2])
         number = self.block.view(-1).index_select(0, flat)
-        value, doubt = torch.empty_like(x), torch.empty_like(x)
+        value, doubt, way = torch.empty_like(x), torch.empty_like(x), torch.zeros_like(x)
         near, far = (torch.nonzero(c).squeeze(-1) for c in (number >= 0, number < 0))
         if len(near):
             within = [
                 (u - BLOCK * h).index_select(0, near) for u, h in zip((x, y, z), home, strict=True)
             ]
-            value[near], doubt[near] = self._near(number.index_select(0, near), *within)
+            cell, corner, within = _cell(number.index_select(0, near), *within)
+            found, error = self._linear(corner, within), self.error.view(-1).index_select(0, cell)
+            value[near], doubt[near] = found, error
+            if direction is not None:
+                d = direction.index_select(0, near).unbind(-1)
+                way[near] = self._way(cell, corner, within, d, found, error)
         if len(far):
             middle = torch.stack([h.index_select(0, far) for h in home], -1).float().add_(0.5)
             away = (place.index_select(0, far) - BLOCK * middle).norm(dim=-1)
             value[far] = self.middle.view(-1).index_select(0, flat.index_select(0, far))
             # beyond the bounds the distance to them was added
             doubt[far] = away * (self.step * math.hypot(self.lipschitz, 1.0))
-        return value, doubt
+        return value, doubt, way
 
-    def _near(self, number: Tensor, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Of points at x, y, z cells from the lowest corner of their blocks: trilinear."""
-        i, j, k = (u.to(torch.int32).clamp_(0, BLOCK - 1) for u in (x, y, z))
-        x, y, z = x - i, y - j, z - k
+    def _linear(self, corner: Tensor, within: Sequence[Tensor]) -> Float[Tensor, "m"]:
+        """Trilinear between the corners of cells, the lowest of which is given."""
         side, flat = BLOCK + 1, self.values.view(-1)
-        corner = (number * side + i).mul_(side).add_(j).mul_(side).add_(k)
+        x, y, z = within
         lines = []
         for offset in (0, side, side * side, side * side + side):
             one, other = (flat.index_select(0, corner + (offset + n)) for n in (0, 1))
             lines.append(torch.lerp(one, other, z))
-        value = torch.lerp(torch.lerp(lines[0], lines[1], y), torch.lerp(lines[2], lines[3], y), x)
-        cell = (number * BLOCK + i).mul_(BLOCK).add_(j).mul_(BLOCK).add_(k)
-        return value, self.error.view(-1).index_select(0, cell)
+        return torch.lerp(torch.lerp(lines[0], lines[1], y), torch.lerp(lines[2], lines[3], y), x)
+
+    def _way(
+        self,
+        cell: Tensor,
+        corner: Tensor,
+        within: Sequence[Tensor],
+        direction: Sequence[Tensor],
+        value: Tensor,
+        error: Tensor,
+    ) -> Float[Tensor, "m"]:
+        """How far to the cell's end [m], where f keeps its sign until there, else 0.
+
+        Along a ray the interpolant g bends by |g''| <= 2 (|x y| + |y z| + |z x|) twist <= 2 twist, x, y,
+        z its direction, so between two ends it is no nearer to 0 than both less twist s^2 / 4.
+        """
+        ends = [
+            torch.where(d == 0, torch.inf, ((d > 0).float() - u) / d)
+            for u, d in zip(within, direction, strict=True)
+        ]
+        s = torch.minimum(torch.minimum(ends[0], ends[1]), ends[2]).clamp_(min=0.0)
+        there = [torch.addcmul(u, s, d) for u, d in zip(within, direction, strict=True)]
+        last = self._linear(corner, there)
+        bend = (s * s).mul_(self.twist.view(-1).index_select(0, cell)).mul_(0.25)
+        least = torch.minimum(value.abs(), last.abs()) - error - bend
+        keeps = (least > 0) & ((value < 0) == (last < 0))
+        return torch.where(keeps, s * self.step + BEYOND, 0.0)
+
+    @cached_property
+    def twist(self) -> Float[Tensor, "k c"]:
+        """The largest mixed second difference of a cell's corners [m], over pairs of axes."""
+        side = BLOCK + 1
+        nodes = self.values.view(-1, side, side, side)
+        most = []
+        for along in (1, 2, 3):
+            one, other = (axis for axis in (1, 2, 3) if axis != along)
+            mixed = nodes.diff(dim=one).diff(dim=other).abs_()
+            ends = (mixed.narrow(along, n, BLOCK) for n in (0, 1))
+            most.append(torch.maximum(*ends).reshape(self.error.shape))
+        return torch.stack(most).amax(0)
+
+
+def _cell(
+    number: Tensor, x: Tensor, y: Tensor, z: Tensor
+) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]:
+    """Cells of points x, y, z cells from the lowest corner of their blocks: number, that of its lowest
+    corner, and where in it."""
+    side = BLOCK + 1
+    i, j, k = (u.to(torch.int32).clamp_(0, BLOCK - 1) for u in (x, y, z))
+    cell = (number * BLOCK + i).mul_(BLOCK).add_(j).mul_(BLOCK).add_(k)
+    corner = (number * side + i).mul_(side).add_(j).mul_(side).add_(k)
+    return cell, corner, (x - i, y - j, z - k)

@@ -1,6 +1,7 @@
 """A neural shape's value, gradient and features as one node of autograd (see ``objects.sweeps``)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -8,7 +9,17 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import linear
 
-from rfsg.objects.sweeps import Layers, Level, Plain, ascend, by_autograd, cast_back, descend, pull
+from rfsg.objects.sweeps import (
+    Layers,
+    Level,
+    Plain,
+    ascend,
+    by_autograd,
+    cast_back,
+    descend,
+    in_precision,
+    pull,
+)
 
 SHARE = math.sqrt(0.5)  # of what enters the skip's layer: two unit variances are one again
 
@@ -70,16 +81,162 @@ class Encoding:
 Answers = tuple[Tensor, ...]  # value [n], gradient [n 3], feature [n h]: those that were asked
 
 
-def answer(asked: Question, point: Float[Tensor, "n 3"], *weights: Tensor) -> Answers:
-    """What is asked, without a graph.
+@torch.no_grad()
+def answer(
+    asked: Question, point: Float[Tensor, "n 3"], weights: Sequence[Tensor], chunk: int
+) -> Answers:
+    """What is asked, without a graph, ``chunk`` points at a time.
 
     weights: (weight, bias) of each hidden layer in turn, of the value and of the features.
     """
-    return _answer(asked, point, weights)[0]
+    folded = Folded.of(weights, asked, point)
+    answers = _empty(asked, folded, point)
+    room = Room.of(folded, point[:chunk])
+    for begin in range(0, len(point), chunk):
+        piece = slice(begin, begin + chunk)
+        _fill(
+            asked,
+            folded,
+            room.of_rows(len(point[piece])),
+            point[piece],
+            [a[piece] for a in answers],
+        )
+    return tuple(a.squeeze(-1) if asked.value and i == 0 else a for i, a in enumerate(answers))
+
+
+@dataclass(frozen=True)
+class Folded:
+    """Weights for y = z + root = 2 x in place of x, so that no pass over the activations halves them:
+    those that y enters are halved instead, and dy/dz = y / root. The skip's share, its weights on the
+    encoding (``again``) and the reach are folded in too. Cast and transposed once for all chunks."""
+
+    down: list[Float[Tensor, "width _"]]
+    up: list[Float[Tensor, "_ width"]]
+    bias: list[Float[Tensor, "width"]]
+    again: Float[Tensor, "width c"]
+    again_up: Float[Tensor, "c width"]
+    value: tuple[Tensor, Tensor]
+    feature: tuple[Tensor, Tensor]
+    softness: Float[Tensor, ""]
+
+    @staticmethod
+    def of(weights: Sequence[Tensor], asked: Question, like: Tensor) -> "Folded":
+        *hidden, value, value_bias, feature, feature_bias = in_precision(weights, like)
+        width = len(hidden[0])
+        first, *rest = hidden[::2]
+        again = SHARE * rest[asked.skip - 1][:, width:]
+        rest[asked.skip - 1] = SHARE * rest[asked.skip - 1][:, :width]
+        down = [first, *(0.5 * weight for weight in rest)]
+        return Folded(
+            down,
+            [weight.t().contiguous() for weight in down],
+            hidden[1::2],
+            again,
+            again.t().contiguous(),
+            (0.5 * asked.reach * value, asked.reach * value_bias),
+            (0.5 * feature, feature_bias),
+            like.new_tensor(asked.softness),
+        )
+
+
+@dataclass(frozen=True)
+class Room:
+    """Memory of one chunk, used again by the next: encoding, its adjoints, y, root, y / root by layer."""
+
+    encoded: Float[Tensor, "n c"]
+    adjoint: Float[Tensor, "n c"]
+    y: tuple[Float[Tensor, "n width"], Float[Tensor, "n width"]]
+    root: Float[Tensor, "n width"]
+    slope: list[Float[Tensor, "n width"]]
+
+    @staticmethod
+    def of(folded: Folded, point: Tensor) -> "Room":
+        width, encoded = folded.down[0].shape
+
+        def room(columns: int) -> Tensor:
+            return point.new_empty(len(point), columns)
+
+        return Room(
+            room(encoded),
+            room(encoded),
+            (room(width), room(width)),
+            room(width),
+            [room(width) for _ in folded.down],
+        )
+
+    def of_rows(self, n: int) -> "Room":
+        """Its first rows: the last chunk is a smaller one."""
+        if n == len(self.root):
+            return self
+        one, other = self.y
+        return Room(
+            self.encoded[:n],
+            self.adjoint[:n],
+            (one[:n], other[:n]),
+            self.root[:n],
+            [s[:n] for s in self.slope],
+        )
+
+
+def _empty(asked: Question, folded: Folded, point: Tensor) -> list[Tensor]:
+    columns = ((asked.value, 1), (asked.gradient, 3), (asked.feature, len(folded.feature[1])))
+    return [point.new_empty(len(point), n) for wanted, n in columns if wanted]
+
+
+def _fill(
+    asked: Question, folded: Folded, room: Room, point: Tensor, answers: Sequence[Tensor]
+) -> None:
+    """The answers of one chunk."""
+    sine, cosine = _encode(asked, room.encoded, point)
+    y, other = room.y
+    for i, (weight, bias) in enumerate(zip(folded.up, folded.bias, strict=True)):
+        torch.addmm(bias, room.encoded if i == 0 else y, weight, out=other)
+        y, other = other, y
+        if i == asked.skip:
+            y.addmm_(room.encoded, folded.again_up)
+        torch.addcmul(folded.softness, y, y, out=room.root).sqrt_()
+        y.add_(room.root)
+        if asked.gradient:
+            torch.div(y, room.root, out=room.slope[i])
+    each = iter(answers)
+    if asked.value:
+        torch.addmm(folded.value[1], y, folded.value[0].t(), out=next(each))
+    gradient = next(each) if asked.gradient else None
+    if asked.feature:
+        torch.addmm(folded.feature[1], y, folded.feature[0].t(), out=next(each))
+    if gradient is not None:
+        adjoint = _fall(asked, folded, room)
+        own, to_sine, to_cosine = adjoint.split([3, sine.shape[1], sine.shape[1]], -1)
+        turned = (to_sine * cosine).sub_(to_cosine * sine).view(-1, len(asked.octaves))
+        along = torch.mv(turned, asked.octaves).view(-1, 3)
+        torch.add(own, along, out=gradient).div_(asked.reach)
+
+
+def _encode(asked: Question, encoded: Tensor, point: Tensor) -> tuple[Tensor, Tensor]:
+    """Fill the encoding; its sines and cosines [n, 3 k]."""
+    own = torch.sub(point, asked.centre, out=encoded[:, :3]).div_(asked.reach)
+    phase = (own[..., None] * asked.octaves).flatten(1)
+    sine, cosine = phase.sin(), phase.cos_()
+    encoded[:, 3 : 3 + sine.shape[1]] = sine
+    encoded[:, 3 + sine.shape[1] :] = cosine
+    return sine, cosine
+
+
+def _fall(asked: Question, folded: Folded, room: Room) -> Float[Tensor, "n c"]:
+    """Adjoint of the encoding where that of the value is 1."""
+    (free, other), adjoint = room.y, room.slope[-1].mul_(folded.value[0])
+    again = room.adjoint.zero_()
+    for i in reversed(range(1, len(folded.down))):
+        if i == asked.skip:
+            torch.mm(adjoint, folded.again, out=again)
+        torch.mm(adjoint, folded.down[i], out=free)
+        adjoint = free.mul_(room.slope[i - 1])
+        free, other = other, free
+    return again.addmm_(adjoint, folded.down[0])
 
 
 def _answer(asked: Question, point: Tensor, weights: tuple[Tensor, ...]) -> tuple[Answers, tuple]:
-    """The answers, and what the way back needs."""
+    """The answers by way of all that the way back needs, which comes with them."""
     *hidden, value_weight, value_bias, feature_weight, feature_bias = weights
     layers = Layers.of(hidden, point, asked.skip, SHARE, asked.softness)
     seed = value_weight.to(point.dtype)
@@ -101,7 +258,7 @@ def _answer(asked: Question, point: Tensor, weights: tuple[Tensor, ...]) -> tupl
 
 
 class ShapeSweep(torch.autograd.Function):
-    """``answer``, differentiable in points and weights."""
+    """The same, differentiable in points and weights."""
 
     @staticmethod
     def forward(ctx, plain: Plain, asked: Question, point: Tensor, *weights: Tensor) -> Answers:

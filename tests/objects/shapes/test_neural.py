@@ -162,14 +162,31 @@ def test_one_sweep_gives_the_same_as_three_questions():
     assert torch.allclose(gradient, s.value_and_gradient(x)[1])
 
 
-def test_chunks_change_nothing():
-    s, x = shape(), points(2 * CPU_CHUNK + 5, dtype=torch.float32)
-    whole = s.value_and_gradient(x)
+@pytest.mark.parametrize("asked", ASKED)
+@pytest.mark.parametrize("count", [0, 1, 2 * CPU_CHUNK + 5])
+def test_answers_without_a_graph_are_those_of_the_plain_sweep(asked, count):
+    s, x = shape(), points(count)
+    whole = asked_plainly(s, x, asked)
     with torch.no_grad():
-        pieces = s.value_and_gradient(x)
+        pieces = asked_at_once(s, x, asked)
     for a, b in zip(whole, pieces, strict=True):
-        assert torch.allclose(a, b, atol=1e-5)
-    assert s.sdf(points(0)).shape == (0,)
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-11)
+    # nothing that a later chunk needs the room of
+    with torch.no_grad():
+        again = asked_at_once(s, x.flip(0), asked)
+    for a, b in zip(pieces, again, strict=True):
+        torch.testing.assert_close(a, b.flip(0), rtol=1e-12, atol=1e-11)
+
+
+def test_float32_without_a_graph_is_as_exact_as_with_one():
+    s, x = shape(), points(4000, dtype=torch.float32)
+    exact = s.value_and_gradient(x.double())
+    recorded = s.value_and_gradient(x)
+    with torch.no_grad():
+        swept = s.value_and_gradient(x)
+    for a, b, c in zip(exact, recorded, swept, strict=True):
+        assert c.dtype == torch.float32
+        assert (c - a).square().mean() <= 1.5 * (b - a).square().mean()
 
 
 def test_dtype_of_the_points_decides_the_precision():
