@@ -4,7 +4,7 @@ Both come from the objects' own contract: planes and bounds for the first, rays 
 from all around for the second.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,18 +49,38 @@ UNBOUNDED = 1e6  # [m] stands for the half-extent of a face without an end
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Points on the curved and learned faces of one node, with normals and patch numbers.
+class Clusters:
+    """Samples that lie together and look the same way: a ball about them, a cone of their normals."""
 
-    reach: distance to the sixth nearest sample [m]; curvature: how fast normals turn there [1/m].
+    members: Int[Tensor, "k m"]  # samples, -1 behind the last
+    centre: Float[Tensor, "k 3"]
+    radius: Float[Tensor, "k"]
+    normal: Float[Tensor, "k 3"]  # axis of the cone
+    cone: Float[Tensor, "k"]  # its half-angle [rad]
+    reach: Float[Tensor, "k"]  # the samples' greatest
+    bend: Float[Tensor, "k"]  # and their greatest 2 curvature reach
+
+    def __len__(self) -> int:
+        return len(self.centre)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points on the curved and learned faces of one shape, with normals and patch numbers, all in the
+    object's frame, and the nodes that have the shape.
+
+    reach: distance to the sixth nearest sample; curvature: how fast normals turn there; patch_column:
+    the patches that occur, counted from 0; centre, radius: of a ball about the shape's bounds.
     """
 
-    node: int
+    nodes: Int[Tensor, "n"]
     point: Float[Tensor, "s 3"]
     normal: Float[Tensor, "s 3"]
     patch: Int[Tensor, "s"]
     reach: Float[Tensor, "s"]
     curvature: Float[Tensor, "s"]
+    patch_column: Int[Tensor, "s"]
+    clusters: Clusters
     centre: Float[Tensor, "3"]
     radius: float
 
@@ -116,44 +136,87 @@ def _rectangles(shape: Shape) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 @torch.no_grad()
 def samples_of(world: World) -> list[Samples]:
-    """Sampled faces of every node that has curved or learned ones."""
-    out = []
+    """Sampled faces of every shape that has curved or learned ones: once for all nodes that have it."""
+    nodes_of: dict[int, list[int]] = {}
     for node, item in enumerate(world.scene.nodes):
-        point, normal, patch, reach, curvature = _sampled(item.body.shape, world.device)
-        if not len(point):
-            continue
-        which = torch.full((len(point),), node, device=world.device)
-        low, high = world.bounds_object[node]
-        out.append(
-            Samples(
-                node,
-                world.point_world(which, point),
-                world.direction_world(which, normal),
-                patch,
-                reach * world.scale[node],
-                curvature / world.scale[node],
-                world.point_world(which[:1], 0.5 * (low + high)[None])[0],
-                float((high - low).norm() * 0.5 * world.scale[node]),
-            )
-        )
+        nodes_of.setdefault(id(item.body.shape), []).append(node)
+    out = []
+    for nodes in nodes_of.values():
+        found = _sampled(world.scene.nodes[nodes[0]].body.shape, world.device)
+        if len(found.point):
+            out.append(replace(found, nodes=torch.tensor(nodes, device=world.device)))
     return out
 
 
-_CACHE: dict[int, tuple[object, tuple[Tensor, ...]]] = {}
+_CACHE: dict[int, tuple[object, Samples]] = {}
 MOST_CACHED = 64
 
 
-def _sampled(shape: Shape, device: torch.device) -> tuple[Tensor, ...]:
-    """Samples in the object's frame, kept while the shape's parameters stay as they are."""
+def _sampled(shape: Shape, device: torch.device) -> Samples:
+    """Samples of a shape and of no node, kept while the shape's parameters stay as they are."""
     state = _state(shape)
     kept = _CACHE.get(id(shape))
     if kept is None or kept[0] != state:
         if len(_CACHE) >= MOST_CACHED:
             _CACHE.clear()
-        point, normal, patch = _shoot(shape, device)
-        kept = (state, (point, normal, patch, *_neighbourhood(point, normal)))
+        kept = (state, _sample(shape, device))
         _CACHE[id(shape)] = kept
     return kept[1]
+
+
+@torch.no_grad()
+def _sample(shape: Shape, device: torch.device) -> Samples:
+    point, normal, patch = _shoot(shape, device)
+    reach, curvature = _neighbourhood(point, normal)
+    low, high = shape.bounds().to(device=device, dtype=torch.float64)
+    column = torch.unique(patch, return_inverse=True)[1]
+    clusters = clustered(point, normal, reach, curvature)
+    centre, radius = 0.5 * (low + high), float((high - low).norm() * 0.5)
+    return Samples(
+        patch[:0], point, normal, patch, reach, curvature, column, clusters, centre, radius
+    )
+
+
+CLUSTER = 64  # samples in a cluster, at most: as many clusters of as many samples, of 4096
+
+
+def clustered(
+    point: Float[Tensor, "s 3"],
+    normal: Float[Tensor, "s 3"],
+    reach: Float[Tensor, "s"],
+    curvature: Float[Tensor, "s"],
+) -> Clusters:
+    """Samples halved, and halved again, where they differ most in place, normal or bend."""
+    # of few samples, with no neighbour to tell, reach is inf and curvature 0
+    bend = torch.where(curvature > 0, 2.0 * curvature * reach, torch.zeros_like(curvature))
+    size = (point - point.mean(0)).norm(dim=-1).mean().clamp(min=1e-300)
+    traits = torch.cat([point / size, normal, bend.clamp(max=1.0)[:, None]], 1)
+    pieces = [torch.arange(len(point), device=point.device)]
+    while len(pieces[0]) > CLUSTER:
+        pieces = [half for piece in pieces for half in _halves(traits, piece)]
+    pieces = [p for p in pieces if len(p)]
+    most = max((len(p) for p in pieces), default=1)
+    members = torch.full((len(pieces), most), -1, dtype=torch.int64, device=point.device)
+    for row, piece in enumerate(pieces):
+        members[row, : len(piece)] = piece
+    held = members >= 0
+    none = torch.zeros_like(members, dtype=point.dtype)
+    share = held / held.sum(1, keepdim=True)
+    centre = (point[members] * share[..., None]).sum(1)
+    axis = unit((normal[members] * share[..., None]).sum(1))
+    away = torch.where(held, (point[members] - centre[:, None]).norm(dim=-1), none)
+    # half the chord is the sine of half the angle: exact for small angles, where a cosine is not
+    chord = torch.where(held, (normal[members] - axis[:, None]).norm(dim=-1), none)
+    cone = 2.0 * torch.asin((0.5 * chord).clamp(max=1.0))
+    reach, bend = (torch.where(held, x[members], none) for x in (reach, bend))
+    return Clusters(members, centre, away.amax(1), axis, cone.amax(1), reach.amax(1), bend.amax(1))
+
+
+def _halves(traits: Tensor, piece: Tensor) -> tuple[Tensor, Tensor]:
+    """A piece in two, at the middle of the trait that varies most."""
+    widest = traits[piece].var(0, unbiased=False).argmax()
+    order = piece[torch.argsort(traits[piece, widest], stable=True)]
+    return order[: (len(piece) + 1) // 2], order[(len(piece) + 1) // 2 :]
 
 
 @torch.no_grad()
@@ -169,7 +232,7 @@ def nearest_facets(
     found = []
     for shape, i in world.groups(which):
         scale = world.scale[which[i]]
-        looks = _looks(shape, world.device, wavelength / float(scale[0]))
+        looks = looks_at(shape, world.device, wavelength / float(scale[0]))
         found.append((i, looks.nearest(local[i])))
     order = torch.argsort(torch.cat([i for i, _ in found]))
     whole = take(joined(*(f for _, f in found)), order)
@@ -196,7 +259,9 @@ class Looks:
     def __init__(self, shape: Shape, device: torch.device, wavelength: float):
         from scipy.spatial import KDTree  # loaded where a face is sampled
 
-        self.point, self.normal, _, _, curvature = _sampled(shape, device)
+        samples = _sampled(shape, device)
+        self.point, self.normal, curvature = samples.point, samples.normal, samples.curvature
+        self.bounds = shape.bounds().to(device=device, dtype=torch.float64)
         self.wavelength = wavelength
         self.world = World(
             Scene((Node("/look", Body(shape, Conductor()), Pose.identity()),)), device
@@ -209,7 +274,10 @@ class Looks:
 
     def nearest(self, point: Float[Tensor, "m 3"]) -> Facets:
         """The facet of the sample nearest to each point."""
-        sample = torch.from_numpy(self.tree.query(point.cpu().numpy())[1]).to(point.device)
+        return self.of(torch.from_numpy(self.tree.query(point.cpu().numpy())[1]).to(point.device))
+
+    def of(self, sample: Int[Tensor, "m"]) -> Facets:
+        """The facets of samples, measured when they are first asked for."""
         asked = torch.unique(sample)
         new = asked[self.row[asked] < 0]
         if len(new):
@@ -228,7 +296,7 @@ class Looks:
 _LOOKS: dict[tuple[int, float], tuple[object, Looks]] = {}
 
 
-def _looks(shape: Shape, device: torch.device, wavelength: float) -> Looks:
+def looks_at(shape: Shape, device: torch.device, wavelength: float) -> Looks:
     """Looks at a shape, kept like the samples themselves."""
     key, state = (id(shape), round(wavelength, 9)), _state(shape)
     kept = _LOOKS.get(key)

@@ -17,6 +17,7 @@ from rfsg.objects.contract import Contact, Crossing
 from rfsg.objects.shapes.kept import BAKE_AFTER
 from rfsg.scene.world import World
 from rfsg.tracer.embree import Proxies
+from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.march import MarchOptions, crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Chains, Crossings, Rays
@@ -95,7 +96,8 @@ def search(
     parts = [_direct(len(tx_position), len(rx_position), depth, world.device)]
     if depth and quality.search != "rays" and (few or quality.search == "enumerate"):
         try:
-            parts.append(enumerate_chains(world, tx_position, rx_position, quality))
+            wavelength = SPEED_OF_LIGHT / float(frequency[0])  # as ``solve`` measures faces
+            parts.append(enumerate_chains(world, tx_position, rx_position, wavelength, quality))
             report.complete = few
         except TooMany:
             if quality.search == "enumerate":

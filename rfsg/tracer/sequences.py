@@ -9,20 +9,24 @@ prefix and suffix give an image at either end, and the glints between the two im
 samples of the face: the same from both ends, whatever the spacing of any rays.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from rfsg.scene.world import World, unit
-from rfsg.tracer.faces import Planes, Samples, planes_of, samples_of
+from rfsg.scene.world import World
+from rfsg.tracer.faces import Planes, Samples, looks_at, planes_of, samples_of
+from rfsg.tracer.glances import astray
+from rfsg.tracer.glints import NEAR, glints
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.reached import reached
 from rfsg.tracer.records import Chains
 
 MOST_PAIRS = 300_000_000  # beam tests and image solves an enumeration may take: a minute or two
-NEAR = 3.0  # times the samples' spacing: how far a glint may lie from its nearest sample
+PORTION = 1 << 16  # pairs of images at a time
+BLOCK = 1 << 20  # (node, prefix) tests at a time: bounds memory
 EDGE = 1e-9  # of a face's extent: a path through a face's very edge belongs to it
 
 
@@ -46,28 +50,29 @@ def enumerate_chains(
     world: World,
     tx_position: Float[Tensor, "t 3"],
     rx_position: Float[Tensor, "r 3"],
+    wavelength: float,
     quality: Quality,
 ) -> Chains:
     """All candidate chains with at most one curved or learned face, direct ones left out.
 
-    Raises TooMany when the scene is too large for it.
+    wavelength: [m] what learned faces are measured at. Raises TooMany when the scene is too large for it.
     """
     planes, samples = planes_of(world), samples_of(world)
     if not quality.curved:
         samples = []
     budget = Budget(MOST_PAIRS)
-    parts = []
+    parts, fore = [], []
     inner = min(quality.depth, quality.curved_depth) - 1 if samples else 0
-    behind = [levels(planes, rx_position[r], inner, budget) for r in range(len(rx_position))]
     for t in range(len(tx_position)):
         ahead = levels(planes, tx_position[t], quality.depth, budget)
         for level in ahead[1:]:
             parts.append(_planar_chains(planes, level, t, rx_position, quality, budget))
+        fore.append(ahead[: inner + 1])
+    if samples:
+        behind = [levels(planes, source, inner, budget) for source in rx_position]
+        ends = _by_level(fore), _by_level(behind)
         for item in samples:
-            fore = [_reaching(planes, p, item) for p in ahead[: inner + 1]]
-            for r in range(len(rx_position)):
-                aft = [_reaching(planes, p, item) for p in behind[r]]
-                parts.append(_glint_chains(planes, item, fore, aft, t, r, quality, budget))
+            parts += _glint_chains(world, planes, item, ends, wavelength, quality, budget)
     return _join(parts, quality.depth, world.device)
 
 
@@ -166,152 +171,166 @@ def _planar_chains(
     return _chains(planes, t, rx, face, seed, quality.depth)
 
 
-def _reaching(planes: Planes, prefixes: Prefixes, item: Samples) -> Prefixes:
-    """Prefixes whose beam may touch the ball about an object."""
-    if not prefixes.faces.shape[1]:
-        return prefixes
-    last = prefixes.faces[:, -1]
-    normal, offset = planes.normal[last], planes.offset[last]
-    near = (prefixes.image * normal).sum(-1) - offset
-    height = item.centre @ normal.T - offset
-    along = (height - near).clamp(min=1e-12)
-    hit = prefixes.image + (-near / along)[:, None] * (item.centre - prefixes.image)
-    uv = torch.einsum("pj,pij->pi", hit - planes.centre[last], planes.edges[last])
-    # the ball's shadow on the face, cast from the image by the ball's nearest point
-    close = (along - item.radius).clamp(min=1e-12)
-    slant = (item.centre - prefixes.image).norm(dim=-1) / along
-    shadow = item.radius * (-near) / close * slant
-    meets = (uv.abs() <= planes.half[last] + shadow[:, None]).all(-1) | (along <= item.radius)
-    keep = (height > -item.radius) & meets & (planes.node[last] != item.node)
-    return prefixes.take(torch.nonzero(keep).squeeze(-1))
+@dataclass(frozen=True)
+class Ends:
+    """The prefixes of one length of all radios at one end of the links, and whose each is."""
+
+    prefixes: Prefixes
+    owner: Int[Tensor, "p"]
+
+    def take(self, i: Tensor) -> "Ends":
+        return Ends(self.prefixes.take(i), self.owner[i])
 
 
-def _glint_chains(
-    planes: Planes,
-    item: Samples,
-    fore: list[Prefixes],
-    aft: list[Prefixes],
-    t: int,
-    r: int,
-    quality: Quality,
-    budget: Budget,
-) -> Chains | None:
-    """(planar..., this object, planar...) between one transmitter and one receiver."""
-    parts = []
-    for i, before in enumerate(fore):
-        for j, after in enumerate(aft):
-            if (
-                i + j + 1 > min(quality.depth, quality.curved_depth)
-                or not len(before.image)
-                or not len(after.image)
-            ):
-                continue
-            pair, sample = _glints(item, before.image, after.image, quality, budget)
-            if not len(pair):
-                continue
-            n = len(after.image)
-            parts.append(
-                _glint_part(
-                    planes,
-                    item,
-                    before.take(pair // n),
-                    after.take(pair % n),
-                    sample,
-                    t,
-                    r,
-                    quality,
-                )
-            )
-    return _join(parts, quality.depth, item.point.device) if parts else None
-
-
-def _glints(
-    item: Samples, fore: Tensor, aft: Tensor, quality: Quality, budget: Budget
-) -> tuple[Tensor, Tensor]:
-    """(pair of images, sample) where the path's length slopes least along the face, in each patch."""
-    pairs, s = len(fore) * len(aft), len(item.point)
-    budget.spend(pairs * s // 8)  # a glance at a sample is cheaper than a beam test
-    none = torch.zeros(0, dtype=torch.int64, device=fore.device)
-    found = [(none, none)]
-    block = max(1, 2_000_000 // s)
-    to_fore, to_aft = fore[:, None] - item.point[None], aft[:, None] - item.point[None]
-    towards_fore, towards_aft = unit(to_fore), unit(to_aft)
-    near_fore = 1.0 / to_fore.norm(dim=-1).clamp(min=1e-9)
-    near_aft = 1.0 / to_aft.norm(dim=-1).clamp(min=1e-9)
-    for begin in range(0, pairs, block):
-        pair = torch.arange(begin, min(pairs, begin + block), device=fore.device)
-        a, b = towards_fore[pair // len(aft)], towards_aft[pair % len(aft)]
-        lit = ((a * item.normal).sum(-1) > 0) & ((b * item.normal).sum(-1) > 0)
-        # the slope of the path's length along the face: zero where it reflects, small when it grazes
-        both = a + b
-        height = (both * item.normal).sum(-1)
-        slope = torch.sqrt(torch.clamp((both * both).sum(-1) - height**2, min=0.0))
-        # slope / bend of the length is how far away, at least, the glint is
-        bend = near_fore[pair // len(aft)] + near_aft[pair % len(aft)] + 2.0 * item.curvature
-        score = torch.where(lit, -slope / (bend * item.reach), torch.full_like(slope, -torch.inf))
-        found.append(_best_of_patch(item, pair, score))
-    pair, sample = (torch.cat(c) for c in zip(*found, strict=True))
-    return pair, sample
-
-
-def _best_of_patch(item: Samples, pair: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
-    """In each patch the best sample, if it is good, and better than all samples near it elsewhere."""
-    patches, column = torch.unique(item.patch, return_inverse=True)
-    best = torch.full((len(pair), len(patches)), -torch.inf, dtype=score.dtype, device=score.device)
-    best = best.scatter_reduce(1, column.expand(len(pair), -1), score, "amax")
-    row, sample = torch.nonzero((score > -NEAR) & (score == best[:, column]), as_tuple=True)
-    keep = ~_outdone(item, row, sample, score)
-    return pair[row[keep]], sample[keep]
-
-
-def _outdone(item: Samples, row: Tensor, sample: Tensor, score: Tensor) -> Bool[Tensor, "m"]:
-    """A candidate with a better one of the same pair beside it (a flat face spans several patches)."""
-    near = 0.12 * item.radius
-    out = torch.zeros(len(row), dtype=torch.bool, device=row.device)
-    order = torch.argsort(row, stable=True)
-    r, s = row[order], sample[order]
-    value = score[r, s]
-    most = int(torch.bincount(r).max()) if len(r) else 0
-    lost = torch.zeros_like(out)
-    for shift in range(1, most):
-        same = r[shift:] == r[:-shift]
-        close = (item.point[s[shift:]] - item.point[s[:-shift]]).norm(dim=-1) < near
-        alike = (item.normal[s[shift:]] * item.normal[s[:-shift]]).sum(-1) > 0.9
-        rival = same & close & alike
-        lost[shift:] |= rival & (value[shift:] <= value[:-shift])
-        lost[:-shift] |= rival & (value[:-shift] < value[shift:])
-    out[order] = lost
+def _by_level(radios: list[list[Prefixes]]) -> list[Ends]:
+    """Prefixes of each length, of all radios together."""
+    out = []
+    for level in zip(*radios, strict=True):
+        image = torch.cat([p.image for p in level])
+        count = torch.tensor([len(p.image) for p in level], device=image.device)
+        owner = torch.arange(len(level), device=image.device).repeat_interleave(count)
+        out.append(Ends(Prefixes(image, torch.cat([p.faces for p in level])), owner))
     return out
 
 
-def _glint_part(
+def _reaching(
+    world: World, planes: Planes, prefixes: Prefixes, item: Samples
+) -> tuple[Int[Tensor, "m"], Int[Tensor, "m"]]:
+    """(node, prefix) where the prefix's beam may touch the ball about the node, node by node."""
+    nodes, p = item.nodes, len(prefixes.image)
+    if not prefixes.faces.shape[1]:
+        every = torch.arange(p, device=nodes.device)
+        return nodes.repeat_interleave(p), every.repeat(len(nodes))
+    centre = world.point_world(nodes, item.centre.expand(len(nodes), 3))
+    radius = item.radius * world.scale[nodes]
+    none = nodes[:0]
+    found = [(none, none)]
+    for some in torch.arange(len(nodes), device=nodes.device).split(max(1, BLOCK // max(p, 1))):
+        meets = _meets(planes, prefixes, centre[some], radius[some])
+        meets &= planes.node[prefixes.faces[:, -1]] != nodes[some, None]
+        row, prefix = torch.nonzero(meets, as_tuple=True)
+        found.append((nodes[some[row]], prefix))
+    node, prefix = (torch.cat(c) for c in zip(*found, strict=True))
+    return node, prefix
+
+
+def _meets(
+    planes: Planes, prefixes: Prefixes, centre: Float[Tensor, "n 3"], radius: Float[Tensor, "n"]
+) -> Bool[Tensor, "n p"]:
+    """Balls that a prefix's beam may touch."""
+    last = prefixes.faces[:, -1]
+    normal, offset = planes.normal[last], planes.offset[last]
+    near = (prefixes.image * normal).sum(-1) - offset
+    height = centre @ normal.T - offset
+    along = (height - near).clamp(min=1e-12)
+    away = centre[:, None] - prefixes.image
+    hit = prefixes.image + (-near / along)[..., None] * away
+    uv = torch.einsum("npj,pij->npi", hit - planes.centre[last], planes.edges[last])
+    # the ball's shadow on the face, cast from the image by the ball's nearest point
+    close = (along - radius[:, None]).clamp(min=1e-12)
+    shadow = radius[:, None] * (-near) / close * away.norm(dim=-1) / along
+    within = (uv.abs() <= planes.half[last] + shadow[..., None]).all(-1)
+    return (height > -radius[:, None]) & (within | (along <= radius[:, None]))
+
+
+def _glint_chains(
+    world: World,
     planes: Planes,
     item: Samples,
-    before: Prefixes,
-    after: Prefixes,
-    sample: Tensor,
-    t: int,
-    r: int,
+    links: tuple[list[Ends], list[Ends]],
+    wavelength: float,
+    quality: Quality,
+    budget: Budget,
+) -> list[Chains]:
+    """(planar..., an object of this shape, planar...) between all transmitters and receivers."""
+    ahead, behind = (
+        [_reaching(world, planes, ends.prefixes, item) for ends in side] for side in links
+    )
+    parts = []
+    for i, before in enumerate(links[0]):
+        for j, after in enumerate(links[1]):
+            if i + j + 1 > min(quality.depth, quality.curved_depth):
+                continue
+            for node, a, b in _paired(len(world), ahead[i], behind[j], item, budget):
+                images = (
+                    world.point_object(node, before.prefixes.image[a]),
+                    world.point_object(node, after.prefixes.image[b]),
+                )
+                pair, sample = glints(item, *images)
+                stays = _promising(
+                    world, node[pair], sample, images[0][pair], images[1][pair], wavelength
+                )
+                pair, sample = pair[stays], sample[stays]
+                ends = before.take(a[pair]), after.take(b[pair])
+                parts.append(_glint_part(world, planes, item, node[pair], sample, ends, quality))
+    return parts
+
+
+def _promising(
+    world: World,
+    node: Int[Tensor, "m"],
+    sample: Int[Tensor, "m"],
+    fore: Float[Tensor, "m 3"],
+    aft: Float[Tensor, "m 3"],
+    wavelength: float,
+) -> Int[Tensor, "k"]:
+    """Candidates on nodes of one shape that a first look at the face, if it is learned, leaves."""
+    stays = torch.ones_like(node, dtype=torch.bool)
+    for scale in torch.unique(world.scale[node[~world.exact[node]]]).tolist():
+        i = torch.nonzero(world.scale[node] == scale).squeeze(-1)
+        shape = world.scene.nodes[int(node[i[0]])].body.shape
+        looks = looks_at(shape, world.device, wavelength / scale)
+        stays[i] = ~astray(looks, sample[i], fore[i], aft[i])
+    return torch.nonzero(stays).squeeze(-1)
+
+
+def _paired(
+    nodes: int,
+    ahead: tuple[Tensor, Tensor],
+    behind: tuple[Tensor, Tensor],
+    item: Samples,
+    budget: Budget,
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Every (node, prefix before it, prefix after it), in portions; both lists lie in order of nodes."""
+    many = [torch.bincount(node, minlength=nodes) for node, _ in (ahead, behind)]
+    count = many[0] * many[1]
+    last = torch.cumsum(count, 0)
+    start = [torch.cumsum(m, 0) - m for m in many]
+    total = int(last[-1]) if nodes else 0
+    budget.spend(total * len(item.clusters))  # samples of clusters that stay are a few times more
+    for begin in range(0, total, PORTION):
+        number = torch.arange(begin, min(total, begin + PORTION), device=count.device)
+        node = torch.searchsorted(last, number, right=True)
+        within = number - (last - count)[node]
+        a = ahead[1][start[0][node] + within // many[1][node]]
+        b = behind[1][start[1][node] + within % many[1][node]]
+        yield node, a, b
+
+
+def _glint_part(
+    world: World,
+    planes: Planes,
+    item: Samples,
+    node: Int[Tensor, "c"],
+    sample: Int[Tensor, "c"],
+    ends: tuple[Ends, Ends],
     quality: Quality,
 ) -> Chains:
     """Chains of one length, seeded by the image method on either side of the sample."""
-    x = item.point[sample]
+    before, after = ends[0].prefixes, ends[1].prefixes
+    x = world.point_world(node, item.point[sample])
     # the glint may lie a few samples away, and its mirror images as far along their faces
-    slack = 2.0 * NEAR * item.reach[sample]
+    slack = 2.0 * NEAR * item.reach[sample] * world.scale[node]
     fore, on_fore = _unfold(planes, before, x, slack)
     aft, on_aft = _unfold(planes, after, x, slack)
-    aft = aft.flip(1)
-    c = len(sample)
-    node = torch.full((c, 1), item.node, dtype=torch.int64, device=x.device)
     back = after.faces.flip(1)
-    which = torch.cat([planes.node[before.faces], node, planes.node[back]], 1)
+    which = torch.cat([planes.node[before.faces], node[:, None], planes.node[back]], 1)
     patch = torch.cat(
         [planes.patch[before.faces], item.patch[sample][:, None], planes.patch[back]], 1
     )
-    seed = torch.cat([fore, x[:, None], aft], 1)
+    seed = torch.cat([fore, x[:, None], aft.flip(1)], 1)
     good = on_fore & on_aft & torch.isfinite(seed).all(-1).all(-1)
-    ends = torch.full((c,), t, device=x.device), torch.full((c,), r, device=x.device)
-    chains = Chains(ends[0], ends[1], which, patch, seed)
+    chains = Chains(ends[0].owner, ends[1].owner, which, patch, seed)
     return _padded(_take(chains, torch.nonzero(good).squeeze(-1)), quality.depth)
 
 
@@ -359,11 +378,10 @@ def _take(chains: Chains, i: Tensor) -> Chains:
     return Chains(*(getattr(chains, n)[i] for n in Chains.__dataclass_fields__))
 
 
-def _join(parts: list[Chains | None], depth: int, device: torch.device) -> Chains:
-    some = [p for p in parts if p is not None]
-    if not some:
+def _join(parts: list[Chains], depth: int, device: torch.device) -> Chains:
+    if not parts:
         none = torch.zeros(0, dtype=torch.int64, device=device)
         empty = none.reshape(0, depth)
         seed = torch.zeros(0, depth, 3, dtype=torch.float64, device=device)
         return Chains(none, none, empty, empty, seed)
-    return Chains(*(torch.cat([getattr(p, n) for p in some]) for n in Chains.__dataclass_fields__))
+    return Chains(*(torch.cat([getattr(p, n) for p in parts]) for n in Chains.__dataclass_fields__))

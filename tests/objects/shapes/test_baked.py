@@ -184,3 +184,27 @@ def test_a_file_too_large_is_not_read(tmp_path, monkeypatch):
     monkeypatch.setattr(kept, "MAX_BYTES", 100)
     with pytest.warns(UserWarning, match="the limit is 100"):
         kept.baked(shape, tmp_path, STEP)
+
+
+@pytest.mark.parametrize("kind", ["ball", "crease"])
+def test_f_keeps_its_sign_as_far_ahead_as_is_said(kind):
+    """Sampled densely all along: in a smooth field, and across creases and saddles of one."""
+
+    def crease(p):
+        x, y, z = p.unbind(-1)
+        return torch.minimum(p.norm(dim=-1) - 0.2, (x - 0.1).abs() + 0.5 * y * z / 0.3 - 0.02)
+
+    shape = Field(ball(0.3) if kind == "ball" else crease, [0.4] * 3, lipschitz=2.0)
+    made = bake(shape, 0.01)
+    generator = torch.Generator().manual_seed(0)
+    some = torch.randint(len(made.zero.vertices), (20_000,), generator=generator)
+    point = made.zero.vertices[some] + 0.01 * torch.randn(20_000, 3, generator=generator)
+    point = point.clamp(-0.38, 0.38)
+    direction = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=generator), dim=-1)
+    value, doubt, way = made.look_ahead(point, direction)
+    assert torch.equal(value, made.look(point)[0]) and torch.equal(doubt, made.look(point)[1])
+    on = torch.nonzero(way > 0).squeeze(-1)
+    assert len(on) > 5000 and float(way.max()) <= 3**0.5 * made.step + 2e-6
+    t = way[on, None] * torch.linspace(0.0, 1.0, 50)
+    f = shape.sdf((point[on, None] + t[..., None] * direction[on, None]).double())
+    assert bool(((f < 0) == (value[on, None] < 0)).all())
