@@ -25,8 +25,8 @@ from rfsg.cli.options import (
     Variants,
 )
 from rfsg.cli.parse import (
+    parse_budget,
     parse_decibel,
-    parse_duration,
     parse_frequency,
     parse_numbers,
     parse_plane,
@@ -113,8 +113,8 @@ def map_(
     budget: Annotated[
         float | None,
         typer.Option(
-            parser=parse_duration,
-            metavar="NUMBER[ms|s|min]",
+            parser=parse_budget,
+            metavar="NUMBER[s|min|h]",
             help="By rays: refine the map until the time is up.",
         ),
     ] = None,
