@@ -35,6 +35,7 @@ from rfsg.tracer.plan import Quality
 
 MOST_REFUSED = 200  # steps refused one after another: nothing will come of it
 STEEPEST = 1e15  # a slope whose square float32 cannot hold is no slope
+MET_DB = 1e-9  # a power predicted to within this is predicted to rounding
 LAST_RATE = 0.01  # of the first, where the rate falls
 SCHEDULES = ("constant", "cosine")
 COLUMNS = ("loss", "data", "regularisation", "error_db")
@@ -256,8 +257,10 @@ class Training:
     # stopping at once
 
     def _refuse_flat(self) -> None:
-        """Many readings together without any slope: nothing can be learned."""
+        """Many readings together without any slope: nothing can be learned, unless all are met."""
         rows = self.pool[:64]
+        if self._met(rows):
+            return
         total, _ = self._loss(rows, 0)
         if not any(bool(g.any()) for g in self._gradients(total)):
             raise LearnError(
@@ -266,6 +269,17 @@ class Training:
                 "saturated (m, alpha or phi at the end of its range), or nothing gets through the "
                 f"object. Selected:\n{self.selection.table()}"
             )
+
+    @torch.no_grad()
+    def _met(self, rows: Tensor) -> bool:
+        """Whether powers among these readings are predicted to rounding: no slope is left there."""
+        predicted, measured = self.predicted(rows), self.measured.take(rows)
+        power = (measured.quantity == int(Quantity.RSSI)) | (
+            measured.quantity == int(Quantity.PATH_GAIN)
+        )
+        known = measured.received & predicted.arrives & power
+        off = residual_db(predicted, measured)[known]
+        return bool(len(off)) and float(off.abs().max()) <= MET_DB
 
     def _why_silent(self) -> str:
         objects = sorted({o for leaf in self.selection.leaves for o in leaf.owners})
