@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
-from machine import measured_on
+from machine import ROOT, measured_on, write_section
 
 import rfsg
 from rfsg.objects.body import Body
@@ -34,6 +34,10 @@ from rfsg.tracer.faces import samples_of
 from rfsg.tracer.launch import fibonacci
 from rfsg.tracer.records import Rays
 
+DOCS = ROOT / "docs" / "performance.md"
+SAID = """Written by `OMP_NUM_THREADS=1 python benchmarks/objects.py --write-docs`: a hall of 40 m with so many
+instances of one trained cabinet, a transmitter and ten receivers. Seconds of the processor but for
+*search*, which is by the wall; *move*: the boxes of a hall in which one cabinet has moved."""
 ASSET = Path(__file__).resolve().parents[1] / "assets" / "objects" / "cabinet" / "cabinet.usda"
 SIDE, HEIGHT, WALL = 40.0, 6.0, 0.2  # [m]
 RAYS = 100_000
@@ -117,21 +121,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 32, 100, 316, 1000])
     parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--write-docs", action="store_true", help=f"a section of {DOCS.name}")
     args = parser.parse_args()
     begin, body = time.perf_counter(), load_asset(ASSET).body
     counts = sorted(args.counts)
     memory = bytes_by_instance(counts[0], counts[-1], body)
     rows = {n: costs(hall(n, body), args.runs) for n in counts}
-    print("| instances | " + " | ".join(f"{c} [s]" for c in COLUMNS) + " |")
-    print("|---" * (len(COLUMNS) + 1) + "|")
-    for n, row in rows.items():
-        print(f"| {n} | " + " | ".join(f"{v:.3f}" for v in row) + " |")
+    lines = [f"| instances | {' | '.join(f'{c} [s]' for c in COLUMNS)} |"]
+    lines += ["|---" * (len(COLUMNS) + 1) + "|"]
+    lines += [f"| {n} | {' | '.join(f'{v:.3f}' for v in row)} |" for n, row in rows.items()]
     decades = math.log10(counts[-1] / counts[0])
     ends = zip(rows[counts[0]], rows[counts[-1]], strict=True)
     ratios = [(b / a) ** (1.0 / decades) if decades else 1.0 for a, b in ends]
-    print("| ratio per decade | " + " | ".join(f"{r:.1f}x" for r in ratios) + " |\n")
-    print(f"Memory: {memory / 1000:.1f} kB by instance.")
-    print(measured_on(time.perf_counter() - begin))
+    lines += [f"| ratio per decade | {' | '.join(f'{r:.1f}x' for r in ratios)} |", ""]
+    lines += [f"Memory: {memory / 1000:.1f} kB by instance.", ""]
+    lines += [measured_on(time.perf_counter() - begin)]
+    print(*lines, sep="\n")
+    if args.write_docs:
+        write_section(DOCS, "## Many objects", SAID, "", *lines)
 
 
 if __name__ == "__main__":
