@@ -256,7 +256,9 @@ def main() -> None:
 
             torch.set_num_threads(options.threads)
             seconds = time.perf_counter() - start
-            write_section(PAGE, heading, SAID[heading].strip(), "", *lines, "", measured_on(seconds))
+            write_section(
+                PAGE, heading, SAID[heading].strip(), "", *lines, "", measured_on(seconds)
+            )
 
 
 if __name__ == "__main__":

@@ -236,7 +236,9 @@ def main() -> None:
 
             torch.set_num_threads(options.threads)
             seconds = time.perf_counter() - start
-            write_section(PAGE, "## The path solver", SAID.strip(), "", *lines, "", measured_on(seconds))
+            write_section(
+                PAGE, "## The path solver", SAID.strip(), "", *lines, "", measured_on(seconds)
+            )
 
 
 if __name__ == "__main__":
