@@ -13,6 +13,7 @@ from torch import Tensor
 
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Shape
+from rfsg.objects.shapes.kept import state_of
 from rfsg.objects.surfaces.interface import Conductor
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
@@ -154,7 +155,7 @@ MOST_CACHED = 64
 
 def _sampled(shape: Shape, device: torch.device) -> Samples:
     """Samples of a shape and of no node, kept while the shape's parameters stay as they are."""
-    state = _state(shape)
+    state = state_of(shape)
     kept = _CACHE.get(id(shape))
     if kept is None or kept[0] != state:
         if len(_CACHE) >= MOST_CACHED:
@@ -298,7 +299,7 @@ _LOOKS: dict[tuple[int, float], tuple[object, Looks]] = {}
 
 def looks_at(shape: Shape, device: torch.device, wavelength: float) -> Looks:
     """Looks at a shape, kept like the samples themselves."""
-    key, state = (id(shape), round(wavelength, 9)), _state(shape)
+    key, state = (id(shape), round(wavelength, 9)), state_of(shape)
     kept = _LOOKS.get(key)
     if kept is None or kept[0] != state:
         if len(_LOOKS) >= MOST_CACHED:
@@ -306,12 +307,6 @@ def looks_at(shape: Shape, device: torch.device, wavelength: float) -> Looks:
         kept = (state, Looks(shape, device, wavelength))
         _LOOKS[key] = kept
     return kept[1]
-
-
-def _state(shape: Shape) -> tuple:
-    """Changes when a parameter of the shape does."""
-    parameters = list(getattr(shape, "parameters", list)())
-    return (shape, tuple((p.data_ptr(), p._version) for p in parameters))
 
 
 def _neighbourhood(point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:

@@ -78,18 +78,14 @@ class Traced(Triangles):
         if threads > 1:
             parts = zip(np.array_split(o, threads), np.array_split(d, threads), strict=True)
             with ThreadPoolExecutor(threads) as pool:  # embreex lets go of the interpreter's lock
-                found = list(pool.map(lambda part: self._run(*part), parts))
+                found = list(pool.map(lambda part: self.shot(*part), parts))
             out = {key: np.concatenate([f[key] for f in found]) for key in found[0]}
         else:
-            out = self._run(o, d)
+            out = self.shot(o, d)
         facing = (torch.from_numpy(out["Ng"]) * direction).sum(-1)
         triangle = torch.from_numpy(out["primID"].astype(np.int32))
         t, u, v = (torch.from_numpy(out[key]) for key in ("tfar", "u", "v"))
         return Met(triangle, t, u, v, facing > 0)
-
-    def _run(self, origin: np.ndarray, direction: np.ndarray) -> dict[str, np.ndarray]:
-        assert self._scene is not None  # a baked shape has triangles
-        return self._scene.run(origin, direction, query="INTERSECT", output=True)
 
 
 class Intersector:

@@ -60,7 +60,7 @@ class Tubes:
         return self.width.shape[0]
 
     def take(self, i: Tensor | slice) -> "Tubes":
-        rays = Rays(self.rays.origin[i], self.rays.direction[i], self.rays.limit[i])
+        rays = self.rays.take(i)
         return Tubes(
             rays, self.width[i], self.spread[i], self.bound[i], self.history[i], self.vertices[i]
         )

@@ -70,7 +70,7 @@ class Beams:
     x: Float[Tensor, "r d 3"]
 
     def take(self, i: Tensor) -> "Beams":
-        rays = Rays(self.rays.origin[i], self.rays.direction[i], self.rays.limit[i])
+        rays = self.rays.take(i)
         rest = (self.which[i], self.patch[i], self.x[i])
         return Beams(self.lattice[i], self.place[i], rays, *rest)
 

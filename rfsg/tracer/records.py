@@ -77,7 +77,7 @@ class Rays:
     direction: Float[Tensor, "r 3"]
     limit: Float[Tensor, "r"]  # [m], inf for none
 
-    def take(self, i: Int[Tensor, "m"]) -> "Rays":
+    def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "r"] | slice) -> "Rays":
         """Some of the rays."""
         return Rays(self.origin[i], self.direction[i], self.limit[i])
 

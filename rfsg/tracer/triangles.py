@@ -31,16 +31,17 @@ class Triangles:
         if self._scene is None or not len(origin):
             none = torch.full((len(origin),), -1, dtype=torch.int64, device=origin.device)
             return none, torch.full_like(origin[:, 0], torch.inf)
-        out = self._scene.run(
-            _float32(origin - self.middle.to(origin)),
-            _float32(direction),
-            query="INTERSECT",
-            output=True,
-        )
+        out = self.shot(_float32(origin - self.middle.to(origin)), _float32(direction))
         triangle = torch.from_numpy(out["primID"].astype(np.int64)).to(origin.device)
         missed = torch.from_numpy(out["geomID"].astype(np.int64)).to(origin.device) < 0
         distance = torch.from_numpy(out["tfar"].astype(np.float64)).to(origin.device)
         return torch.where(missed | (triangle < 0), -1, triangle), distance
+
+    def shot(self, origin: np.ndarray, direction: np.ndarray) -> dict[str, np.ndarray]:
+        """All that Embree says of rays, float32 [r 3], from origins about ``middle``. There must be
+        triangles."""
+        assert self._scene is not None
+        return self._scene.run(origin, direction, query="INTERSECT", output=True)
 
 
 def _float32(x: Tensor) -> np.ndarray:

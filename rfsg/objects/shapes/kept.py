@@ -97,10 +97,14 @@ def baked_if_it_pays(shape: Shape, rays: int) -> Baked | None:
     return kept.baked
 
 
-def _of(shape: Shape) -> _Kept:
-    # the shape itself is held, so that its id is no other's
+def state_of(shape: Shape) -> tuple:
+    """Changes when a parameter of the shape does. It holds the shape, so that its id is no other's."""
     parameters = list(getattr(shape, "parameters", list)())
-    state = (shape, tuple((p.data_ptr(), p._version) for p in parameters))
+    return (shape, tuple((p.data_ptr(), p._version) for p in parameters))
+
+
+def _of(shape: Shape) -> _Kept:
+    state = state_of(shape)
     kept = _MEMORY.get(id(shape))
     if kept is None or kept.state != state:
         if len(_MEMORY) >= MOST_KEPT:
