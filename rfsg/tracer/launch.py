@@ -114,10 +114,7 @@ def search(
             if not len(tubes):
                 break
             parts.append(_receive(tubes, t, rx_position, depth, quality, report))
-    chains = Chains(
-        *(torch.cat([getattr(p, n) for p in parts]) for n in Chains.__dataclass_fields__)
-    )
-    chains = _few_curved(world, chains, quality)
+    chains = _few_curved(world, Chains.joined(parts), quality)
     report.candidates = len(chains.tx)
     return chains, report
 
@@ -130,8 +127,7 @@ def _few_curved(world: World, chains: Chains, quality: Quality) -> Chains:
     curved = (~planar & (chains.which >= 0)).sum(1)
     order = (chains.which >= 0).sum(1)
     few = (curved == 0) | ((curved <= quality.curved) & (order <= quality.curved_depth))
-    i = torch.nonzero(few).squeeze(-1)
-    return Chains(*(getattr(chains, n)[i] for n in Chains.__dataclass_fields__))
+    return chains.take(torch.nonzero(few).squeeze(-1))
 
 
 def first_tubes(position: Float[Tensor, "3"], quality: Quality) -> Tubes:

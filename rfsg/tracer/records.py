@@ -117,6 +117,16 @@ class Chains:
     patch: Int[Tensor, "c d"]
     seed: Float[Tensor, "c d 3"]
 
+    def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "c"]) -> "Chains":
+        """Some of the chains."""
+        return Chains(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
+
+    @staticmethod
+    def joined(parts: Sequence["Chains"]) -> "Chains":
+        """All chains of some records of one depth, in order."""
+        names = Chains.__dataclass_fields__
+        return Chains(*(torch.cat([getattr(p, n) for p in parts]) for n in names))
+
 
 @dataclass(frozen=True)
 class Paths:

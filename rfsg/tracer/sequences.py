@@ -331,7 +331,7 @@ def _glint_part(
     seed = torch.cat([fore, x[:, None], aft.flip(1)], 1)
     good = on_fore & on_aft & torch.isfinite(seed).all(-1).all(-1)
     chains = Chains(ends[0].owner, ends[1].owner, which, patch, seed)
-    return _padded(_take(chains, torch.nonzero(good).squeeze(-1)), quality.depth)
+    return _padded(chains.take(torch.nonzero(good).squeeze(-1)), quality.depth)
 
 
 def _unfold(
@@ -374,14 +374,10 @@ def _padded(chains: Chains, depth: int) -> Chains:
     )
 
 
-def _take(chains: Chains, i: Tensor) -> Chains:
-    return Chains(*(getattr(chains, n)[i] for n in Chains.__dataclass_fields__))
-
-
 def _join(parts: list[Chains], depth: int, device: torch.device) -> Chains:
     if not parts:
         none = torch.zeros(0, dtype=torch.int64, device=device)
         empty = none.reshape(0, depth)
         seed = torch.zeros(0, depth, 3, dtype=torch.float64, device=device)
         return Chains(none, none, empty, empty, seed)
-    return Chains(*(torch.cat([getattr(p, n) for p in parts]) for n in Chains.__dataclass_fields__))
+    return Chains.joined(parts)
