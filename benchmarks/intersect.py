@@ -18,16 +18,19 @@ from dataclasses import dataclass, replace
 import torch
 import trimesh
 from machine import ROOT, measured_on, write_page
+from sweeps import section
 from torch import Tensor
 from torch.nn import functional as F
 
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.baked import bake
-from rfsg.objects.shapes.band import Surface
+from rfsg.objects.shapes.band import Baked, Surface
+from rfsg.objects.shapes.kept import tensors_of
 from rfsg.objects.shapes.neural import NeuralShape, compute_lipschitz
 from rfsg.scene.assets import load_asset
-from rfsg.tracer.intersect import WAYS, Intersector, Traced
+from rfsg.tracer.intersect import WAYS, Intersector, Rest
 from rfsg.tracer.march import EVALUATE, plain_march
+from rfsg.tracer.traced import Traced
 
 CABINET = ROOT / "assets" / "objects" / "cabinet" / "cabinet.usda"
 PAGE = ROOT / "docs" / "intersection.md"
@@ -90,9 +93,10 @@ def naive(shape: Shape, rays: Rays) -> Answer:
 def pruned(traced: Intersector, shape: Shape, rays: Rays) -> Answer:
     """Sphere tracing with care: rays that miss the convex hull left out, those that are done too, a stop at
     1 mm and one Newton step."""
-    origin, direction, _ = rays
+    origin, direction, length = rays
     hit, found = torch.zeros(len(origin), dtype=torch.bool), torch.zeros(len(origin))
-    i, start, d, entry, left = traced._in_shell(*rays)
+    whole = Rest(torch.arange(len(origin)), origin, direction, torch.zeros_like(length), length)
+    i, start, d, entry, left = traced._in_shell(whole)
     t, active = torch.zeros(len(i)), torch.arange(len(i))
     done = torch.zeros(len(i), dtype=torch.bool)
     for _ in range(2 * NAIVE_STEPS):
@@ -172,11 +176,14 @@ def table(name: str, shape: Shape, count: int, runs: int, step: float | None) ->
             rates[way.name].append(way.most / (time.perf_counter() - begin))
     some = tuple(x[:CHECKED] for x in rays)
     true = truth(shape, some)  # type: ignore[arg-type]
+    off = shape.sdf(baked.shell.vertices).median()
+    size = sum(t.nbytes for t in tensors_of(baked).values()) / 2**20
     lines = [
         f"{name}: {count} rays ({100 * float(true[0].double().mean()):.0f} % hit; naive runs on "
         f"{min(count, NAIVE_RAYS)}, the pruned march on {min(count, 5 * NAIVE_RAYS)}), errors on "
         f"{len(some[0])}. Baked in {seconds:.1f} s at {1e3 * baked.step:.3g} mm: "
-        f"{len(baked.zero.triangles)} triangles, a shell {1e3 * baked.level:.1f} mm outside.",
+        f"{len(baked.zero.triangles)} triangles; {len(baked.shell.triangles)} of a shell, half of it "
+        f"less than {1e3 * float(off):.2g} mm outside; {size:.0f} MB of file.",
         "",
         "| way | krays/s | x naive | x pruned march | false / missed % | off mm, 50 / 99 % |",
         "|---|---|---|---|---|---|",
@@ -191,7 +198,19 @@ def table(name: str, shape: Shape, count: int, runs: int, step: float | None) ->
         cells += errors(way.run(some), true)  # type: ignore[arg-type]
         lines.append(f"| {' | '.join(cells)} |")
         print(lines[-1], flush=True)
-    return [*lines, ""]
+    return [*lines, "", *said(baked)]
+
+
+def said(baked: Baked) -> list[str]:
+    """What the baked shape itself says that each way errs by."""
+    parts = [
+        f"{way} {1e3 * off.usual:.2g} / {1e3 * off.most:.2g} mm / {100 * off.lost:.2g} %"
+        for way, off in baked.offs.items()
+    ]
+    return [
+        f"Off by what was found when it was baked (99 % / most / lost): {'; '.join(parts)}.",
+        "",
+    ]
 
 
 @torch.no_grad()
@@ -266,6 +285,7 @@ def main() -> None:
     if given.only != "cabinet":
         lines += table("A thin pane", thin_pane(), given.rays, given.runs, given.step)
     lines += floor(cabinet, given.runs)
+    lines += section(given.runs)
     lines += [measured_on(time.perf_counter() - start)]
     print("\n".join(lines))
     if given.write_docs:

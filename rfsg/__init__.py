@@ -19,7 +19,8 @@ Conventions, everywhere:
   antennas for 1 W in. Path gain is |h|^2.
 - Positions, lengths, delays and phases are float64.
 - Parameter values change in place, as torch's optimisers do; the structure of a scene never does:
-  ``moved``, ``replaced`` and ``without`` return a new scene that shares the objects.
+  ``moved``, ``replaced``, ``without``, ``added`` and ``with_variant`` return a new scene that shares
+  the objects.
 
 Nothing heavy is imported until one of the names below is asked for.
 """
@@ -28,18 +29,22 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rfsg.assets import export as export
     from rfsg.learn.fit import Fitted as Fitted
     from rfsg.learn.fit import fit as fit
     from rfsg.learn.measurements import Measurements as Measurements
     from rfsg.learn.predict import predict as predict
     from rfsg.objects.body import Body as Body
     from rfsg.scene.arrays import Array as Array
+    from rfsg.scene.importers import import_scene as import_scene
+    from rfsg.scene.library import Library as Library
     from rfsg.scene.patterns import Pattern as Pattern
     from rfsg.scene.pose import Pose as Pose
     from rfsg.scene.radios import Radio as Radio
     from rfsg.scene.scene import Node as Node
     from rfsg.scene.scene import Scene as Scene
     from rfsg.scene.scene import SceneError as SceneError
+    from rfsg.scene.usd.live import LiveScene as LiveScene
     from rfsg.tracer.dial import simulate_within as simulate_within
     from rfsg.tracer.mimo import capacity as capacity
     from rfsg.tracer.mimo import mimo as mimo
@@ -56,6 +61,8 @@ _HOME = {
     "Array": "rfsg.scene.arrays",
     "Body": "rfsg.objects.body",
     "Fitted": "rfsg.learn.fit",
+    "Library": "rfsg.scene.library",
+    "LiveScene": "rfsg.scene.usd.live",
     "Measurements": "rfsg.learn.measurements",
     "Node": "rfsg.scene.scene",
     "Pattern": "rfsg.scene.patterns",
@@ -66,7 +73,9 @@ _HOME = {
     "Scene": "rfsg.scene.scene",
     "SceneError": "rfsg.scene.scene",
     "capacity": "rfsg.tracer.mimo",
+    "export": "rfsg.assets",
     "fit": "rfsg.learn.fit",
+    "import_scene": "rfsg.scene.importers",
     "mimo": "rfsg.tracer.mimo",
     "predict": "rfsg.learn.predict",
     "radio_map": "rfsg.tracer.radiomap",
@@ -80,6 +89,8 @@ __all__ = [
     "Array",
     "Body",
     "Fitted",
+    "Library",
+    "LiveScene",
     "Measurements",
     "Node",
     "Pattern",
@@ -90,7 +101,9 @@ __all__ = [
     "Scene",
     "SceneError",
     "capacity",
+    "export",
     "fit",
+    "import_scene",
     "mimo",
     "predict",
     "radio_map",

@@ -23,6 +23,7 @@ from matplotlib.patheffects import withStroke
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 from scipy.spatial import ConvexHull
 
+from rfsg.objects.plain import array
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.tracer.cells import Grid
@@ -86,13 +87,13 @@ def path_lines(paths: Any, channel: Any) -> tuple[list[np.ndarray], np.ndarray]:
 
     Weakest first, so that the strongest lie on top.
     """
-    power = _numpy(channel.gain)[:, 0]
-    power = np.abs(power) ** 2 * ~_numpy(channel.blocked)
+    power = array(channel.gain)[:, 0]
+    power = np.abs(power) ** 2 * ~array(channel.blocked)
     if not (power > 0).any():
         return [], np.zeros(0)
     floor = power.max() * 10 ** (-DYNAMIC_RANGE_DB / 10)
     chosen = [p for p in np.argsort(power)[-MOST_PATHS:] if power[p] > floor]
-    vertices, corners = _numpy(paths.vertices), (_numpy(paths.which) >= 0).sum(axis=1) + 2
+    vertices, corners = array(paths.vertices), (array(paths.which) >= 0).sum(axis=1) + 2
     return [vertices[p, : corners[p]] for p in chosen], 10 * np.log10(power[chosen])
 
 
@@ -101,11 +102,11 @@ def delay_figure(scene: Scene, channel: Any, links: Sequence[tuple[int, int]]) -
     rows = max(1, len(links))
     figure = Figure(figsize=(8.0, 1.2 + 1.9 * rows), layout="constrained")
     panels = figure.subplots(rows, 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    power, delay = np.abs(_numpy(channel.gain)[:, 0]) ** 2, 1e9 * _numpy(channel.delay)
-    heard = (power > 0) & ~_numpy(channel.blocked)
+    power, delay = np.abs(array(channel.gain)[:, 0]) ** 2, 1e9 * array(channel.delay)
+    heard = (power > 0) & ~array(channel.blocked)
     peak = 10 * np.log10(power[heard].max()) if heard.any() else 0.0
     for panel, (tx, rx) in zip(panels, links, strict=False):
-        mine = heard & (_numpy(channel.tx) == tx) & (_numpy(channel.rx) == rx)
+        mine = heard & (array(channel.tx) == tx) & (array(channel.rx) == rx)
         level = 10 * np.log10(power[mine])
         seen = level > peak - 2 * DYNAMIC_RANGE_DB
         bottom = peak - 2 * DYNAMIC_RANGE_DB
@@ -166,7 +167,7 @@ def metric_values(
     Raises ValueError for an unknown metric.
     """
     if metric == "best-server":
-        best = _numpy(radio_map.best_server())
+        best = array(radio_map.best_server())
         return np.ma.masked_less(best, 0), "best server"
     if metric == "rss":
         every, label = radio_map.rss_dbm(), "received signal strength [dBm]"
@@ -177,7 +178,7 @@ def metric_values(
     else:
         raise ValueError(f"metric {metric!r}: expected rss, path-loss, sinr or best-server")
     silence = np.full((1, *radio_map.cells.shape), -np.inf)
-    shown = _numpy(every) if transmitter is None else _numpy(every)[[transmitter]]
+    shown = array(every) if transmitter is None else array(every)[[transmitter]]
     value = np.ma.masked_invalid(np.concatenate([silence, shown]).max(axis=0))
     return (-value if metric == "path-loss" else value), label
 
@@ -197,7 +198,7 @@ def _map_look(value: np.ma.MaskedArray, servers: int | None) -> dict[str, Any]:
 def _plane_figure(
     cells: Grid, scene: Scene, value: np.ma.MaskedArray, look: dict[str, Any]
 ) -> tuple[Figure, Axes]:
-    x, y = _edges(_numpy(cells.x), cells.cell), _edges(_numpy(cells.y), cells.cell)
+    x, y = _edges(array(cells.x), cells.cell), _edges(array(cells.y), cells.cell)
     tall = min(1.4, np.ptp(y) / np.ptp(x))
     figure = Figure(figsize=(8.5, 1.6 + 7.0 * tall), layout="constrained")
     axes = figure.add_subplot()
@@ -220,7 +221,7 @@ def _surface_figure(
 ) -> tuple[Figure, Any]:
     figure = Figure(figsize=(9.0, 7.0), layout="constrained")
     axes = figure.add_subplot(projection="3d")
-    triangles, value = _numpy(cells.triangle), value[_numpy(cells.owner)]
+    triangles, value = array(cells.triangle), value[array(cells.owner)]
     colours = look["cmap"](look["norm"](value.filled(0.0)))
     colours[np.ma.getmaskarray(value)] = to_rgba(_NOTHING)
     # edges of the same colour close the seams between triangles
@@ -243,7 +244,7 @@ def cut(
     with torch.no_grad():
         parts = point.clamp(low, high).to(_dtype(node)).split(16_384)
         value = torch.cat([node.body.shape.sdf(part) for part in parts]).double() + beyond
-    return _contours(across, up, _numpy(value).reshape(CUT, CUT))
+    return _contours(across, up, array(value).reshape(CUT, CUT))
 
 
 def _is_level(plane: Pose) -> bool:
@@ -418,7 +419,7 @@ def sampled(node: Node) -> tuple[Pose, np.ndarray, np.ndarray, np.ndarray, np.nd
         abs(float(node.pose.rotation[2, 2].detach())) > 1.0 - 1e-9
     )  # rounding of a turn about z
     frame = node.pose if upright else Pose.identity()
-    box = _numpy(frame.point_object(torch.as_tensor(corners(node))))
+    box = array(frame.point_object(torch.as_tensor(corners(node))))
     low, high = box.min(axis=0), box.max(axis=0)
     margin = 2.0 * (high - low) / np.array(GRID)  # two cells: every outline closes in the grid
     spans = zip(low - margin, high + margin, GRID, strict=True)
@@ -427,7 +428,7 @@ def sampled(node: Node) -> tuple[Pose, np.ndarray, np.ndarray, np.ndarray, np.nd
     point = node.pose.point_object(frame.point_world(grid.reshape(-1, 3))).to(_dtype(node))
     with torch.no_grad():
         value = torch.cat([node.body.shape.sdf(part) for part in point.split(16_384)])
-    return frame, x, y, z, _numpy(value.double()).reshape(grid.shape[:-1])
+    return frame, x, y, z, array(value.double()).reshape(grid.shape[:-1])
 
 
 def corners(node: Node) -> Float[np.ndarray, "8 3"]:
@@ -436,13 +437,13 @@ def corners(node: Node) -> Float[np.ndarray, "8 3"]:
     if not bool(torch.isfinite(torch.stack([low, high])).all()):
         return np.full((8, 3), np.inf)
     pick = torch.tensor([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], device=low.device)
-    return _numpy(node.pose.point_world(torch.where(pick.bool(), high, low)))
+    return array(node.pose.point_world(torch.where(pick.bool(), high, low)))
 
 
 def scene_bounds(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner [m] of all bounded objects and radios; a metre cube if empty."""
     points = [box for box in map(corners, scene.nodes) if np.isfinite(box).all()]
-    points += [_numpy(r.position)[None] for r in (*scene.transmitters, *scene.receivers)]
+    points += [array(r.position)[None] for r in (*scene.transmitters, *scene.receivers)]
     if not points:
         return np.zeros(3), np.ones(3)
     every = np.concatenate(points)
@@ -470,7 +471,7 @@ def _draw_space(axes: Any, scene: Scene) -> None:
             axes.add_collection3d(Line3DCollection(edges, colors=_EDGE, **look))
     for radios, colour, mark in ((scene.transmitters, _TX, "^"), (scene.receivers, _RX, ".")):
         if radios:
-            place = np.stack([_numpy(radio.position) for radio in radios])
+            place = np.stack([array(radio.position) for radio in radios])
             axes.plot(*place.T, mark, color=colour, markersize=7)
     _frame_space(axes, low, high)
 
@@ -496,7 +497,7 @@ def _radios(axes: Axes, scene: Scene, receivers: bool = True) -> None:
         groups.append((scene.receivers, _RX, "o", 4.0, "receiver"))
     for radios, colour, mark, size, label in groups:
         if radios:
-            place = np.stack([_numpy(radio.position) for radio in radios])
+            place = np.stack([array(radio.position) for radio in radios])
             style = {"color": colour, "markersize": size, "markeredgecolor": "white"}
             axes.plot(place[:, 0], place[:, 1], mark, zorder=6, label=label, **style)
     if any(group[0] for group in groups):
@@ -519,16 +520,16 @@ def _is_thing(node: Node, scene_size: float) -> bool:
 
 def _extent(node: Node) -> tuple[float, float, float]:
     """Smaller and larger horizontal side and height [m] of an object's own box."""
-    low, high = _numpy(node.body.shape.bounds())
+    low, high = array(node.body.shape.bounds())
     size = (high - low) * float(node.pose.scale.detach())
-    up = int(np.argmax(np.abs(_numpy(node.pose.rotation)[2])))  # its axis nearest to the vertical
+    up = int(np.argmax(np.abs(array(node.pose.rotation)[2])))  # its axis nearest to the vertical
     across = sorted(float(side) for i, side in enumerate(size) if i != up)
     return across[0], across[1], float(size[up])
 
 
 def _to_world(frame: Pose, ring: np.ndarray, z: float) -> np.ndarray:
     flat = np.column_stack([ring, np.full(len(ring), z)])
-    return _numpy(frame.point_world(torch.tensor(flat)))
+    return array(frame.point_world(torch.tensor(flat)))
 
 
 def _dtype(node: Node) -> torch.dtype:
@@ -551,7 +552,3 @@ def _name(path: str) -> str:
 
 def _plural(count: int, word: str) -> str:
     return f"{count} {word}" if count == 1 else f"{count} {word}s"
-
-
-def _numpy(value: Any) -> np.ndarray:
-    return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)

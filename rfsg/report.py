@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rfsg.objects.plain import array
+
 if TYPE_CHECKING:
     from rfsg.scene.scene import Scene
 
@@ -84,6 +86,8 @@ def output_folder(out: Path, overwrite: bool = False) -> Iterator[Path]:
         yield beside
         out.mkdir(exist_ok=True)
         for file in sorted(beside.iterdir()):
+            if file.is_dir():  # a folder takes the place of one of its name, whole
+                shutil.rmtree(out / file.name, ignore_errors=True)
             os.replace(file, out / file.name)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
@@ -95,63 +99,10 @@ def write_links(result: Any, file: Path) -> None:
 
 
 def write_paths(result: Any, file: Path) -> None:
-    """paths.csv: one row per arriving path, link by link, strongest first, at the first frequency.
+    """paths.csv: one row per arriving path; columns and order are those of ``pathtable.path_rows``."""
+    from rfsg.tracer.pathtable import path_rows
 
-    ``phase_rad`` is that of gain * exp(-j 2 pi f delay), in (-pi, pi]. Angles are in the world:
-    departure along the travel from the transmitter, arrival from the receiver back to the wave.
-    ``interactions`` lists what happens in order along the path, in the words of ``records.Act`` and
-    "penetration"; ``vertices`` is "x y z; x y z".
-    """
     _write_table(file, PATH_COLUMNS, path_rows(result))
-
-
-def path_rows(result: Any) -> list[dict[str, Any]]:
-    """The rows of paths.csv; see ``write_paths``."""
-    from rfsg.tracer.channel import coefficients
-
-    scene, paths, channel = result.scene, result.paths, result.channel
-    gain, delay, doppler = (_numpy(x) for x in (channel.gain, channel.delay, channel.doppler))
-    which, act, vertices = (_numpy(x) for x in (paths.which, paths.act, paths.vertices))
-    phase = np.angle(_numpy(coefficients(channel))[:, 0])
-    tx, rx = _numpy(channel.tx), _numpy(channel.rx)
-    leave, arrive = angles_deg(_numpy(channel.departure)), angles_deg(_numpy(channel.arrival))
-    through = _crossed_by_path(channel)
-    rows = []
-    for p in arriving(channel):
-        acts = [(int(a), int(i)) for a, i in zip(act[p], which[p], strict=True) if i >= 0]
-        corners = vertices[p][: len(acts) + 2]
-        rows.append(
-            {
-                "tx": scene.transmitters[tx[p]].path,
-                "rx": scene.receivers[rx[p]].path,
-                "delay_ns": 1e9 * delay[p],
-                "gain_db": 20 * np.log10(abs(gain[p, 0])),
-                "phase_rad": phase[p],
-                "doppler_hz": doppler[p],
-                "aod_azimuth_deg": leave[p, 0],
-                "aod_elevation_deg": leave[p, 1],
-                "aoa_azimuth_deg": arrive[p, 0],
-                "aoa_elevation_deg": arrive[p, 1],
-                "interactions": _interactions(scene, acts, through.get(int(p), [])),
-                "vertices": "; ".join(" ".join(f"{x:.6f}" for x in corner) for corner in corners),
-            }
-        )
-    return rows
-
-
-def arriving(channel: Any) -> np.ndarray:
-    """Indices of the paths that carry power, link by link, strongest first."""
-    power = np.abs(_numpy(channel.gain)[:, 0]) ** 2
-    tx, rx = _numpy(channel.tx), _numpy(channel.rx)
-    order = np.lexsort((-power, rx, tx))
-    return order[(power[order] > 0) & ~_numpy(channel.blocked)[order]]
-
-
-def angles_deg(direction: np.ndarray) -> np.ndarray:
-    """Azimuth and elevation [deg] of unit vectors [n, 3]: [n, 2]."""
-    x, y, z = direction.T + 0.0  # -0 would turn +180 degrees into -180
-    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
-    return np.degrees(np.stack([azimuth, elevation], axis=-1))
 
 
 def write_channel(result: Any, file: Path, responses: dict[str, Any] | None = None) -> None:
@@ -167,12 +118,12 @@ def write_channel(result: Any, file: Path, responses: dict[str, Any] | None = No
     scene, channel, paths = result.scene, result.channel, result.paths
     names = ("tx", "rx", "frequency", "delay", "gain", "doppler", "departure", "arrival")
     arrays: dict[str, Any] = {
-        name: _numpy(getattr(channel, name)) for name in (*names, "crossed", "blocked")
+        name: array(getattr(channel, name)) for name in (*names, "crossed", "blocked")
     }
     shared = ("which", "act", "item", "vertices", "status")
-    arrays |= {name: _numpy(getattr(paths, name)) for name in shared}
+    arrays |= {name: array(getattr(paths, name)) for name in shared}
     arrays |= {
-        "path_gain": _numpy(result.path_gain()),
+        "path_gain": array(result.path_gain()),
         "tx_paths": np.array([radio.path for radio in scene.transmitters], dtype=str),
         "rx_paths": np.array([radio.path for radio in scene.receivers], dtype=str),
         "node_paths": np.array([node.path for node in scene.nodes], dtype=str),
@@ -210,11 +161,11 @@ def response_arrays(
     def over(bands: list[Any]) -> np.ndarray:
         found = zip(carriers, bands, strict=True)
         parts = [response.frequency_response(one, *size, band, time) for one, band in found]
-        return _numpy(torch.stack(parts, 2))
+        return array(torch.stack(parts, 2))
 
     arrays: dict[str, Any] = {}
     if snapshots is not None:
-        arrays |= {"time": _numpy(time), "transfer": over([c.frequency for c in carriers])[..., 0]}
+        arrays |= {"time": array(time), "transfer": over([c.frequency for c in carriers])[..., 0]}
     if bandwidth_hz is not None:
         bands = [
             response.subcarriers(float(f), bandwidth_hz, subcarriers)
@@ -223,9 +174,9 @@ def response_arrays(
         sampled = [response.taps(one, *size, bandwidth_hz, time=time) for one in carriers]
         arrays |= {
             "bandwidth": float(bandwidth_hz),
-            "subcarrier_frequency": np.stack([_numpy(band) for band in bands]),
+            "subcarrier_frequency": np.stack([array(band) for band in bands]),
             "cfr": over(bands),
-            "taps": _numpy(torch.stack([t.gain for t in sampled], 2)),
+            "taps": array(torch.stack([t.gain for t in sampled], 2)),
             "first_tap": sampled[0].first,
         }
     return arrays
@@ -246,7 +197,7 @@ def _mimo_arrays(result: Any) -> dict[str, Any]:
     except SceneError as error:  # too large; the rest of the run is not lost for it
         return {"mimo_left_out": np.array(str(error))}
     return {
-        "mimo": _numpy(matrices),
+        "mimo": array(matrices),
         "mimo_tx_ports": np.array([len(ports) for ports in found.tx_ports]),
         "mimo_rx_ports": np.array([len(ports) for ports in found.rx_ports]),
     }
@@ -268,19 +219,19 @@ def write_map(
         if hasattr(cells, "plane")
         else ("triangle", "owner", "point", "normal", "area")
     )
-    arrays: dict[str, Any] = {name: _numpy(getattr(cells, name)) for name in names}
+    arrays: dict[str, Any] = {name: array(getattr(cells, name)) for name in names}
     if hasattr(cells, "plane"):
-        u, v = _numpy(cells.plane.rotation).T[:2]
-        arrays |= {"origin": _numpy(cells.plane.translation), "u": u, "v": v}
+        u, v = array(cells.plane.rotation).T[:2]
+        arrays |= {"origin": array(cells.plane.translation), "u": u, "v": v}
     np.savez_compressed(
         file,
         **arrays,
-        path_gain=_numpy(radio_map.path_gain),
-        error_db=_numpy(radio_map.error_db),
-        path_loss_db=_numpy(radio_map.path_loss_db()),
-        rss_dbm=_numpy(radio_map.rss_dbm()),
-        sinr_db=_numpy(radio_map.sinr_db(bandwidth_hz, noise_figure_db)),
-        best_server=_numpy(radio_map.best_server()),
+        path_gain=array(radio_map.path_gain),
+        error_db=array(radio_map.error_db),
+        path_loss_db=array(radio_map.path_loss_db()),
+        rss_dbm=array(radio_map.rss_dbm()),
+        sinr_db=array(radio_map.sinr_db(bandwidth_hz, noise_figure_db)),
+        best_server=array(radio_map.best_server()),
         tx_paths=np.array([radio.path for radio in radio_map.scene.transmitters], dtype=str),
         frequency=float(radio_map.frequency),
         bandwidth=float(bandwidth_hz),
@@ -296,12 +247,13 @@ def write_json(facts: dict[str, Any], file: Path) -> None:
 
 def report(result: Any, **facts: Any) -> dict[str, Any]:
     """What report.json holds: what was asked, modelled, left out, counted and timed."""
+    from rfsg.tracer.pathtable import arriving
     from rfsg.tracer.records import Status
 
     sentences = {status.name: status.sentence for status in Status}
     return facts | {
         "quality": _plain(result.plan.quality),
-        "frequency_hz": _numpy(result.channel.frequency).tolist(),
+        "frequency_hz": array(result.channel.frequency).tolist(),
         "modelled": list(result.plan.modelled),
         "left_out": list(result.plan.left_out),
         "objects": len(result.scene.nodes),
@@ -367,7 +319,7 @@ def _radio_row(role: str, radio: Any) -> dict[str, Any]:
 
 def _node_row(node: Any) -> dict[str, Any]:
     shape, surface = node.body.shape, node.body.surface
-    low, high = _numpy(shape.bounds()) * float(node.pose.scale.detach())
+    low, high = array(shape.bounds()) * float(node.pose.scale.detach())
     config = surface.config() if hasattr(surface, "config") else {}
     return {
         "path": node.path,
@@ -387,29 +339,7 @@ def _count(module: Any) -> int:
 
 
 def _place(point: Any) -> str:
-    return " ".join(f"{x:.3g}" for x in _numpy(point))
-
-
-def _interactions(
-    scene: "Scene", acts: list[tuple[int, int]], crossed: list[tuple[int, int]]
-) -> str:
-    """What happens at vertices, as (act, node), and penetrations, as (segment, node), in order."""
-    from rfsg.tracer.records import Act
-
-    words = []
-    for segment in range(len(acts) + 1):
-        words += [f"penetration({scene.nodes[i].path})" for s, i in crossed if s == segment]
-        if segment < len(acts):
-            act, node = acts[segment]
-            words.append(f"{Act(act).word}({scene.nodes[node].path})")
-    return " ".join(words) or "line_of_sight"
-
-
-def _crossed_by_path(channel: Any) -> dict[int, list[tuple[int, int]]]:
-    through: dict[int, list[tuple[int, int]]] = {}
-    for path, node, segment in _numpy(channel.crossed).tolist():
-        through.setdefault(path, []).append((segment, node))
-    return through
+    return " ".join(f"{x:.3g}" for x in array(point))
 
 
 def _write_table(file: Path, columns: tuple[str, ...], rows: list[dict[str, Any]]) -> None:
@@ -444,7 +374,3 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, str | int | bool):
         return value
     return str(value)
-
-
-def _numpy(value: Any) -> np.ndarray:
-    return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)

@@ -10,7 +10,7 @@ import pytest
 import typer
 
 from rfsg import cli
-from rfsg.cli import parse
+from rfsg.cli import app, parse
 
 SCENE = """#usda 1.0
 (
@@ -143,6 +143,16 @@ def test_planes_and_variants_are_read():
             parse.parse_variants([wrong])
 
 
+def test_moves_and_additions_are_read():
+    assert parse.parse_move("/World/A=1,2,3") == ("/World/A", (1.0, 2.0, 3.0), 0.0)
+    assert parse.parse_move("/World/A = 1, 2, 3, -90") == ("/World/A", (1.0, 2.0, 3.0), -90.0)
+    found = parse.parse_addition("/World/A=b@home/a.usda@1,2,3,45")
+    assert found == ("/World/A", "b@home/a.usda", (1.0, 2.0, 3.0), 45.0)
+    for wrong in ("/World/A=a.usda", "/World/A=@1,2,3", "a.usda@1,2,3", "/World/A=a.usda@1,2"):
+        with pytest.raises(typer.BadParameter):
+            parse.parse_addition(wrong)
+
+
 def test_quality_fields_keep_their_types():
     quality = parse.parse_quality("draft", ["depth=4", "epsilon=0.02", "integral=riemann"])
     assert (quality.depth, quality.epsilon, quality.integral) == (4, 0.02, "riemann")
@@ -220,6 +230,15 @@ def test_results_are_not_overwritten_unasked(faked, tmp_path, capsys):
         (["simulate", "FILE", "--out", "o", "--move", "/World/Wal=1,2,3"], 3, "/World/Wal:"),
         (["simulate", "FILE", "--out", "o", "--without", "/Nothing"], 3, "/Nothing"),
         (["simulate", "FILE", "--out", "o", "--replace", "/World/Wall=no.usda"], 3, "no.usda"),
+        (["simulate", "FILE", "--out", "o", "--swap", "/World/Wall=no.usda"], 3, "no.usda"),
+        (["simulate", "FILE", "--out", "o", "--remove", "/Nothing"], 3, "/Nothing"),
+        (["simulate", "FILE", "--out", "o", "--move", "/World/Wall=1,2,3,4,5"], 2, "degrees"),
+        (["simulate", "FILE", "--out", "o", "--add", "/World/X=no.usda@1,2,3"], 3, "no.usda"),
+        (["simulate", "FILE", "--out", "o", "--add", "/World/X=no.usda"], 2, "PATH=ASSET@x,y,z"),
+        (["map", "FILE", "--out", "o", "--add", "/World/X=a@b.usda@1,2"], 2, "three numbers"),
+        (["map", "FILE", "--out", "o", "--save", "FILE"], 2, "--overwrite"),
+        (["tradeoff", "FILE", "--out", "o", "--save", "FILE"], 2, "--overwrite"),
+        (["simulate", "FILE", "--out", "o", "--save", "e.usda"], 3, "made in Python"),
         (["simulate", "FILE", "--out", "o", "--link", "/A=/B"], 2, "/World/AP=/World/rx_0"),
         (["simulate", "FILE", "--out", "o", "--device", "abacus"], 2, "abacus"),
         (["simulate", "nowhere.usda", "--out", "o"], 3, "nowhere.usda"),
@@ -266,12 +285,17 @@ def test_learn_shape_passes_its_options_on(monkeypatch, tmp_path, capsys):
         options["progress"](1, 5, "surface error 3.00 mm")
         return SimpleNamespace(surface_mean_mm=1.25, steps=5)
 
+    drawn: list[object] = []
     monkeypatch.setattr("rfsg.learn.geometry.learn_shape_file", learn)
+    monkeypatch.setattr("rfsg.assets.illustrate", lambda asset, **_: drawn.append(asset))
     options = ["--steps", "5", "--scale", "0.01", "--up", "Y", "--fresh", "--seed", "7"]
     assert cli.run(["learn-shape", str(mesh), "-o", str(tmp_path / "a.usda"), *options]) == 0
     assert asked["steps"] == 5 and asked["scale"] == 0.01 and asked["up_axis"] == "y"
     assert asked["resume"] is False and asked["seed"] == 7 and asked["overwrite"] is False
-    assert "surface_mean_mm" in capsys.readouterr().out
+    assert "surface_mean_mm" in capsys.readouterr().out and drawn == [tmp_path / "a.usda"]
+    (tmp_path / "a.png").write_bytes(b"mine")
+    assert cli.run(["learn-shape", str(mesh), "-o", str(tmp_path / "a.usda"), *options]) == 3
+    assert "a.png: already exists" in capsys.readouterr().err and len(drawn) == 1
 
 
 @pytest.mark.parametrize(
@@ -289,7 +313,16 @@ def test_other_failures_have_their_codes(faked, tmp_path, monkeypatch, capsys, e
     assert "Traceback" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["simulate", "map", "check", "info", "learn-shape"])
+def test_other_tools_layouts_lie_beside_the_rest(faked, tmp_path):
+    arguments = ["simulate", str(faked["file"]), "--out", str(tmp_path / "o"), "--overwrite"]
+    for _ in range(2):  # the second time over what is there
+        assert cli.run([*arguments, "--channel", "sionna", "--channel", "deepmimo"]) == 0
+    with np.load(tmp_path / "o" / "cir.npz") as found:
+        assert found["a"].shape[:5] == (1, 2, 1, 1, 1)
+    assert (tmp_path / "o" / "deepmimo" / "params.json").is_file()
+
+
+@pytest.mark.parametrize("command", app.COMMANDS)
 def test_help_answers_for_every_command(command, capsys):
     assert cli.run([command, "--help"]) == 0
     assert command in capsys.readouterr().out
@@ -303,6 +336,63 @@ def test_a_real_scene_from_file_to_files(scene_file, tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     rows = (out / "paths.csv").read_text().splitlines()
     assert len(rows) == 3 and "line_of_sight" in rows[1] and "reflection(/World/Cabinet)" in rows[2]
+
+
+@pytest.fixture
+def post(tmp_path):
+    """An asset: a screen of metal."""
+    from rfsg.objects.body import Body
+    from rfsg.objects.shapes.analytic import Box
+    from rfsg.objects.surfaces.interface import Conductor
+    from rfsg.scene.assets import save_asset
+
+    return save_asset(tmp_path / "post.usda", Body(Box((1.0, 0.1, 1.0)), Conductor()))
+
+
+def test_edits_are_kept_as_a_layer_that_gives_the_same_results(scene_file, post, tmp_path, capsys):
+    source, saved = scene_file.read_bytes(), tmp_path / "edits.usda"
+    edits = ["--swap", f"/World/Cabinet={post}", "--add", f"/World/New/P={post}@2,-1,1,5"]
+    edits += ["--move", "/World/Cabinet=0.5,0,0,10", "--move", "/World/AP=0,0,0.25"]
+    options = ["--quality", "draft", "--out"]
+    arguments = ["simulate", str(scene_file), *edits, "--save", str(saved)]
+    assert cli.run([*arguments, *options, str(tmp_path / "a")]) == 0
+    printed = capsys.readouterr()
+    assert str(saved) in printed.out and printed.err == ""
+    assert scene_file.read_bytes() == source
+    assert cli.run(["simulate", str(saved), *options, str(tmp_path / "b")]) == 0
+    one, other = ((tmp_path / o / "links.csv").read_text().splitlines() for o in "ab")
+    assert one == other and len(one) == 2
+    one, other = ((tmp_path / o / "paths.csv").read_text() for o in "ab")
+    assert "/World/New/P" in one and [r.split(",")[:5] for r in one.splitlines()] == [
+        r.split(",")[:5] for r in other.splitlines()
+    ]
+    report = json.loads((tmp_path / "a" / "report.json").read_text())
+    assert report["save"] == str(saved) and report["add"] == [edits[3]]
+    assert cli.run([*arguments, *options, str(tmp_path / "c")]) == 2  # it is there now
+    assert "--overwrite" in capsys.readouterr().err
+    gone = ["map", str(saved), "--remove", "/World/New", "--cell", "1", "--set", "map_rays=2000"]
+    more = ["--save", str(tmp_path / "more.usda"), "--out", str(tmp_path / "d")]
+    assert cli.run([*gone, "--quality", "draft", *more]) == 0
+    assert "active = false" in (tmp_path / "more.usda").read_text()
+    assert cli.run(["info", str(tmp_path / "more.usda")]) == 0
+    assert "/World/New" not in capsys.readouterr().out
+
+
+def test_edit_writes_a_layer_and_says_what_its_readers_need(scene_file, post, tmp_path, capsys):
+    from rfsg.cli.edit import edit
+
+    alone = typer.Typer()
+    alone.command("edit")(edit)
+    saved = tmp_path / "far" / "edits.usda"
+    saved.parent.mkdir()
+    alone([str(scene_file), "--remove", "/World/Cabinet", "-o", str(saved)], standalone_mode=False)
+    printed = capsys.readouterr()
+    assert printed.out == f"{saved}: the edits, as a layer over the scene\n"
+    assert printed.err.startswith("note: ") and str(tmp_path) in printed.err
+    assert cli.run(["info", str(saved)]) == 3
+    assert cli.run(["info", str(saved), "--asset-root", str(tmp_path)]) == 0
+    with pytest.raises(typer.BadParameter, match="--overwrite"):
+        alone([str(scene_file), "--save", str(saved)], standalone_mode=False)
 
 
 def test_a_map_of_a_real_scene(scene_file, tmp_path, capsys):

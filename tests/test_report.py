@@ -10,6 +10,7 @@ import torch
 
 from rfsg import report
 from rfsg.scene.world import World
+from rfsg.tracer import pathtable
 from rfsg.tracer.cells import grid_on, plane_through
 from rfsg.tracer.channel import Link, thermal_noise_dbm
 from rfsg.tracer.patches import patches_of
@@ -39,7 +40,7 @@ def test_paths_are_the_arriving_ones_strongest_first(small_run, tmp_path):
 
 
 def test_a_path_row_says_what_the_channel_says(small_run):
-    direct = report.path_rows(small_run)[0]
+    direct = pathtable.path_rows(small_run)[0]
     assert direct["delay_ns"] == pytest.approx(1e9 * 4.0 / SPEED_OF_LIGHT, rel=1e-12)
     assert direct["gain_db"] == pytest.approx(20 * np.log10(0.0239 / 4.0), rel=1e-12)
     expected = np.angle(np.exp(-2j * np.pi * 1e9 * 4.0 / SPEED_OF_LIGHT))
@@ -53,7 +54,7 @@ def test_every_act_has_its_word(small_run, act):
     words = {Act.REFLECT: "reflection", Act.DIFFRACT: "diffraction", Act.SCATTER: "scattering"}
     words |= {Act.ENTER: "refraction_in", Act.LEAVE: "refraction_out"}
     small_run.paths.act[1] = int(act)
-    assert report.path_rows(small_run)[1]["interactions"] == f"{words[act]}(/World/Wall)"
+    assert pathtable.path_rows(small_run)[1]["interactions"] == f"{words[act]}(/World/Wall)"
 
 
 @pytest.mark.parametrize(
@@ -62,7 +63,7 @@ def test_every_act_has_its_word(small_run, act):
     + [((0.5, -0.5, 0.5**0.5), -45, 45), ((-1, -0.0, -0.0), 180, 0)],
 )
 def test_angles(direction, azimuth, elevation):
-    angles = report.angles_deg(np.array([direction], dtype=float))
+    angles = pathtable.angles_deg(np.array([direction], dtype=float))
     assert angles[0] == pytest.approx([azimuth, elevation])
 
 

@@ -12,11 +12,13 @@ from pathlib import Path
 from make_meshes import MAKERS
 from rich.progress import Progress
 
+from rfsg.assets import illustrate
 from rfsg.learn.geometry import Report, learn_shape_file
 from rfsg.objects.contract import Surface
 from rfsg.objects.surfaces.interface import Conductor
 from rfsg.objects.surfaces.stochastic import StochasticSurface
 from rfsg.scene.assets import load_asset
+from rfsg.scene.library import Library
 
 OBJECTS = Path(__file__).resolve().parents[1] / "objects"
 PRIOR = "radio material is a prior, not fitted to measurements"
@@ -67,6 +69,7 @@ def train(name: str, meshes: Path) -> None:
             ),
             overwrite=True,
         )
+    illustrate(OBJECTS / name / f"{name}.usda", overwrite=True)
 
 
 def write_readme() -> None:
@@ -76,6 +79,7 @@ def write_readme() -> None:
         if path.exists():
             rows.append(_row(name, Report(**load_asset(path).provenance["report"])))
     (OBJECTS / "README.md").write_text(README + "".join(rows))
+    Library(OBJECTS)  # writes its index
 
 
 def _row(name: str, r: Report) -> str:

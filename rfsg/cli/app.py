@@ -9,20 +9,30 @@ import typer
 
 from rfsg import __version__
 from rfsg.cli.assets import check, info, learn_shape
+from rfsg.cli.edit import edit
 from rfsg.cli.errors import INTERRUPTED, verdict
+from rfsg.cli.export import assets, export
 from rfsg.cli.fit import fit
 from rfsg.cli.fit_regions import fit_regions
+from rfsg.cli.imports import import_
 from rfsg.cli.map import map_
+from rfsg.cli.neuralise import neuralise
 from rfsg.cli.simulate import simulate
 from rfsg.cli.terminal import say
 from rfsg.cli.tradeoff import tradeoff
+from rfsg.cli.view import view
 
 COMMANDS: dict[str, Callable[..., None]] = {  # in the order of --help
     "simulate": simulate,
     "map": map_,
     "tradeoff": tradeoff,
+    "view": view,
+    "edit": edit,
     "check": check,
     "info": info,
+    "export": export,
+    "import": import_,
+    "neuralise": neuralise,
     "learn-shape": learn_shape,
     "fit": fit,
     "fit-regions": fit_regions,
@@ -39,6 +49,7 @@ app = typer.Typer(
 )
 for _name, _command in COMMANDS.items():
     app.command(_name)(_command)
+app.add_typer(assets, name="assets")
 
 
 @app.callback(invoke_without_command=True)

@@ -9,6 +9,7 @@ import typer
 
 from rfsg.cli.options import (
     HERTZ,
+    Additions,
     Changes,
     Device,
     Frequency,
@@ -17,11 +18,13 @@ from rfsg.cli.options import (
     Overwrite,
     Preset,
     Removals,
-    Replacements,
     Roots,
+    Save,
     SceneFile,
     Seed,
+    Swaps,
     Time,
+    Untrusted,
     Variants,
 )
 from rfsg.cli.parse import (
@@ -32,7 +35,7 @@ from rfsg.cli.parse import (
     parse_plane,
     parse_quality,
 )
-from rfsg.cli.scenes import asked_of_scene, device_named, edit, read_scene
+from rfsg.cli.scenes import Edits, asked_of_scene, device_named, edit, read_scene
 from rfsg.cli.terminal import bar, note, print_files
 
 if TYPE_CHECKING:
@@ -130,11 +133,14 @@ def map_(
     quality: Preset = "standard",
     changes: Changes = [],
     move: Moves = [],
-    replace: Replacements = [],
-    without: Removals = [],
+    swap: Swaps = [],
+    remove: Removals = [],
+    add: Additions = [],
+    save: Save = None,
     asset_root: Roots = [],
     variant: Variants = [],
     time: Time = None,
+    untrusted: Untrusted = False,
     device: Device = "cpu",
     seed: Seed = 0,
     overwrite: Overwrite = False,
@@ -153,8 +159,10 @@ def map_(
         raise typer.BadParameter("--height, --plane, --on: give one; --bounds goes with a plane")
     question = parse_quality(quality, changes)
     report.refuse_taken(out, overwrite)
+    edits = Edits(move, swap, remove, add, save)
+    edits.refuse_taken(overwrite)
     band = bandwidth or 20e6
-    edited = edit(read_scene(scene, asset_root, variant, time), move, replace, without)
+    edited = edit(read_scene(scene, asset_root, variant, time, untrusted), edits, None, overwrite)
     shown = None if transmitter is None else _transmitter(edited, transmitter)
     options: dict[str, Any] = {"quality": question, "seed": seed, "device": device_named(device)}
     options |= {} if cell is None else {"cell": cell}
@@ -173,7 +181,7 @@ def map_(
             found = radiomap.radio_map_on(edited, on, frequency, offset=offset, **options)
         else:
             found = radiomap.radio_map(edited, frequency, **where, **options)
-    asked = asked_of_scene(scene, move, replace, without, asset_root, variant, time)
+    asked = asked_of_scene(scene, edits, asset_root, variant, time)
     asked |= {"frequency_hz": found.frequency, "cells": list(found.cells.shape), "cell": cell}
     asked |= {"height": height, "plane": plane, "bounds": bounds, "on": on, "offset": offset}
     asked |= {"metric": metric.value, "bandwidth_hz": band, "noise_figure_db": noise_figure}

@@ -70,20 +70,41 @@ Moves = Annotated[
     list[str],
     typer.Option(
         "--move",
-        metavar="PATH=X,Y,Z",
-        help="Move an object by metres, from where it stands: /World/Cabinet=1.2,0,0.",
+        metavar="PATH=X,Y,Z[,YAW]",
+        help="Move an object, a radio or a group by metres, from where it stands: "
+        "/World/Cabinet=1.2,0,0; with a fourth number also turn it about z, in degrees.",
     ),
 ]
-Replacements = Annotated[
+Swaps = Annotated[
     list[str],
     typer.Option(
+        "--swap",
         "--replace",
         metavar="PATH=ASSET",
         help="Put another asset in an object's place: /World/Cabinet=desk.usda.",
     ),
 ]
 Removals = Annotated[
-    list[str], typer.Option("--without", metavar="PATH", help="Leave an object out.")
+    list[str],
+    typer.Option(
+        "--remove", "--without", metavar="PATH", help="Leave an object, a radio or a group out."
+    ),
+]
+Additions = Annotated[
+    list[str],
+    typer.Option(
+        "--add",
+        metavar="PATH=ASSET@X,Y,Z[,YAW]",
+        help="Add an object from its asset: /World/Desk_2=desk.usda@1,2,0,90.",
+    ),
+]
+Save = Annotated[
+    Path | None,
+    typer.Option(
+        "--save",
+        metavar="EDITS.usda",
+        help="Also keep the edits: as a USD layer over the scene, which stays as it is.",
+    ),
 ]
 Receivers = Annotated[
     Path | None,
@@ -92,3 +113,10 @@ Receivers = Annotated[
 Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:1.")]
 Seed = Annotated[int, typer.Option(help="Seed of everything random; it is written down.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that are there.")]
+Untrusted = Annotated[
+    bool,
+    typer.Option(
+        "--untrusted",
+        help="Read a stranger's file in a child process with limits on time, memory and files.",
+    ),
+]

@@ -44,9 +44,9 @@ def parse_duration(text: str) -> float:
     return value
 
 
-def parse_budget(text: str) -> float:
-    """'2s', '5min' or '1.5h' in seconds."""
-    value = _quantity(text, SPANS)
+def parse_budget(text: str | float) -> float:
+    """'2s', '5min' or '1.5h' in seconds; a default comes as the number it is."""
+    value = _quantity(str(text), SPANS)
     if not 0.0 < value < math.inf:
         raise typer.BadParameter(f"{text!r} is not a time; write for example 5min")
     return value
@@ -117,11 +117,28 @@ def parse_pair(text: str, what: str) -> tuple[str, str]:
     return left, right
 
 
-def parse_move(text: str) -> tuple[str, tuple[float, float, float]]:
-    """'/World/Cabinet=1.2,0,0' as path and metres."""
+def parse_move(text: str) -> tuple[str, tuple[float, float, float], float]:
+    """'/World/Cabinet=1.2,0,0,90' as path, metres and degrees; the last may be left out."""
     path, numbers = parse_pair(text, "PATH=x,y,z in metres, as in /World/Cabinet=1.2,0,0")
-    x, y, z = parse_numbers(numbers, 3, f"three numbers in metres, as in {path}=1.2,0,0")
-    return path, (x, y, z)
+    return path, *_place(numbers, f"as in {path}=1.2,0,0 or, turned, {path}=1.2,0,0,90")
+
+
+def parse_addition(text: str) -> tuple[str, str, tuple[float, float, float], float]:
+    """'/World/Desk_2=desk.usda@1,2,0,90' as path, asset, metres and degrees."""
+    what = "PATH=ASSET@x,y,z in metres, as in /World/Desk_2=desk.usda@1,2,0"
+    path, rest = parse_pair(text, what)
+    asset, at, numbers = rest.rpartition("@")
+    if not (at and asset.strip()):
+        raise typer.BadParameter(f"{text!r}: expected {what}")
+    return path, asset.strip(), *_place(numbers, "as in desk.usda@1,2,0 or, turned, @1,2,0,90")
+
+
+def _place(numbers: str, example: str) -> tuple[tuple[float, float, float], float]:
+    """'1,2,0' or '1,2,0,90' as metres and degrees."""
+    turned = numbers.count(",") == 3
+    what = f"three numbers in metres, and degrees about z if wanted, {example}"
+    x, y, z, *yaw = parse_numbers(numbers, 4 if turned else 3, what)
+    return (x, y, z), yaw[0] if yaw else 0.0
 
 
 def parse_quality(name: str, changes: list[str]) -> "Quality":

@@ -1,12 +1,15 @@
 """The scene that a command works on: read as its options say, and edited; and where it runs."""
 
 import math
+import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
-from rfsg.cli.parse import parse_move, parse_pair, parse_variants
+from rfsg.cli.parse import parse_addition, parse_move, parse_pair, parse_variants
+from rfsg.cli.terminal import note
 
 if TYPE_CHECKING:
     from rfsg.scene.scene import Scene
@@ -17,12 +20,18 @@ def must_exist(file: Path) -> None:
         raise FileNotFoundError(2, "no such file", str(file))
 
 
-def read_scene(file: Path, roots: list[Path], variants: list[str], time: float | None) -> "Scene":
+def read_scene(
+    file: Path,
+    roots: list[Path],
+    variants: list[str],
+    time: float | None,
+    untrusted: bool = False,
+) -> "Scene":
     must_exist(file)
     options = reading_options(roots, variants, time)
     from rfsg.scene.scene import Scene
 
-    return Scene.from_usd(file, **options)
+    return Scene.from_usd(file, untrusted=untrusted, **options)
 
 
 def reading_options(roots: list[Path], variants: list[str], time: float | None) -> dict[str, Any]:
@@ -36,42 +45,65 @@ def reading_options(roots: list[Path], variants: list[str], time: float | None) 
     return {"asset_roots": roots, "variants": chosen, "time": time}
 
 
+@dataclass(frozen=True)
+class Edits:
+    """What the options of the command line change in a scene, as they were written."""
+
+    move: list[str]
+    swap: list[str]
+    remove: list[str]
+    add: list[str]
+    save: Path | None = None
+
+    def refuse_taken(self, overwrite: bool) -> None:
+        """Before anything is read: the file that the edits go to must be free."""
+        if self.save is not None and self.save.exists() and not overwrite:
+            raise typer.BadParameter(f"--save {self.save}: already exists; --overwrite replaces it")
+
+    def asked(self) -> dict[str, Any]:
+        """What report.json says of them."""
+        said: dict[str, Any] = {"move": self.move, "swap": self.swap, "remove": self.remove}
+        return said | {"add": self.add, "save": self.save and str(self.save)}
+
+
 def edit(
-    scene: "Scene",
-    moves: list[str],
-    replacements: list[str],
-    removals: list[str],
-    receivers: Path | None = None,
+    scene: "Scene", edits: Edits, receivers: Path | None = None, overwrite: bool = False
 ) -> "Scene":
-    """The scene after the edits of the command line: replaced, moved, left out, re-equipped."""
-    for text in replacements:
+    """The scene after the edits of the command line: swapped, added to, moved, left out, re-equipped;
+    kept, if that is asked."""
+    for text in edits.swap:
         path, asset = parse_pair(text, "PATH=ASSET, as in /World/Cabinet=desk.usda")
         must_exist(Path(asset))
         scene = scene.replaced(path, asset)
-    for text in moves:
-        path, metres = parse_move(text)
-        scene = scene.moved(path, metres)
-    for path in removals:
+    for text in edits.add:
+        path, asset, metres, yaw = parse_addition(text)
+        must_exist(Path(asset))
+        scene = scene.added(asset, path, at=metres, yaw_deg=yaw)
+    for text in edits.move:
+        path, metres, yaw = parse_move(text)
+        scene = scene.moved(path, metres, yaw_deg=yaw)
+    for path in edits.remove:
         scene = scene.without(path)
     if receivers is not None:
         from rfsg.scene.receivers import from_csv
 
         must_exist(receivers)
         scene = scene.with_receivers(from_csv(receivers))
+    if edits.save is not None:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            scene.save_edits(edits.save, overwrite)
+        for warning in caught:
+            note(str(warning.message))
+        typer.echo(f"{edits.save}: the edits, as a layer over the scene")
     return scene
 
 
 def asked_of_scene(
-    scene: Path,
-    moves: list[str],
-    replacements: list[str],
-    removals: list[str],
-    roots: list[Path],
-    variants: list[str],
-    time: float | None,
+    scene: Path, edits: Edits, roots: list[Path], variants: list[str], time: float | None
 ) -> dict[str, Any]:
     """What report.json says of how the scene was read and edited."""
-    asked = {"scene": str(scene), "move": moves, "replace": replacements, "without": removals}
+    asked = {"scene": str(scene)} | edits.asked()
     return asked | {"asset_roots": roots, "variants": variants, "time_code": time}
 
 

@@ -1,5 +1,6 @@
 """``rfsg simulate``: every path between the scene's radios, and the channels they make."""
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -8,6 +9,7 @@ import typer
 from rfsg.cli.options import (
     HERTZ,
     Accuracy,
+    Additions,
     Budget,
     Changes,
     Device,
@@ -18,11 +20,13 @@ from rfsg.cli.options import (
     Preset,
     Receivers,
     Removals,
-    Replacements,
     Roots,
+    Save,
     SceneFile,
     Seed,
+    Swaps,
     Time,
+    Untrusted,
     Variants,
 )
 from rfsg.cli.parse import (
@@ -32,12 +36,20 @@ from rfsg.cli.parse import (
     parse_pair,
     parse_quality,
 )
-from rfsg.cli.scenes import asked_of_scene, device_named, edit, read_scene
+from rfsg.cli.scenes import Edits, asked_of_scene, device_named, edit, read_scene
 from rfsg.cli.terminal import bar, note, print_files, print_table
 
 if TYPE_CHECKING:
     from rfsg.scene.scene import Scene
     from rfsg.tracer.simulate import Result
+
+
+class Layout(StrEnum):
+    """Tools whose layout of a channel is known; see docs/interchange.md."""
+
+    sionna = "sionna"
+    deepmimo = "deepmimo"
+
 
 MOST_ROWS = 30  # of the table on the terminal; links.csv holds all
 
@@ -51,8 +63,10 @@ def simulate(
     accuracy: Accuracy = None,
     budget: Budget = None,
     move: Moves = [],
-    replace: Replacements = [],
-    without: Removals = [],
+    swap: Swaps = [],
+    remove: Removals = [],
+    add: Additions = [],
+    save: Save = None,
     receivers: Receivers = None,
     bandwidth: Annotated[
         float | None,
@@ -81,16 +95,22 @@ def simulate(
         list[str],
         typer.Option(metavar="TX=RX", help="Draw this link's delay profile (repeatable)."),
     ] = [],
+    channel: Annotated[
+        list[Layout],
+        typer.Option(help="Also write the channel as this tool reads it (repeatable)."),
+    ] = [],
     asset_root: Roots = [],
     variant: Variants = [],
     time: Time = None,
+    untrusted: Untrusted = False,
     device: Device = "cpu",
     seed: Seed = 0,
     overwrite: Overwrite = False,
 ) -> None:
     """Find every path between the scene's radios, and the channels they make.
 
-    Writes links.csv, paths.csv, channel.npz, report.json, scene.png and pdp.png into --out.
+    Writes links.csv, paths.csv, channel.npz, report.json, scene.png and pdp.png into --out; with
+    --channel also cir.npz (Sionna) or a folder deepmimo.
 
     --accuracy or --budget take the place of --quality: the setting is chosen by pilot runs.
 
@@ -108,7 +128,10 @@ def simulate(
         )
     question, carriers = parse_quality(quality, changes), parse_frequencies(frequency)
     report.refuse_taken(out, overwrite)
-    edited = edit(read_scene(scene, asset_root, variant, time), move, replace, without, receivers)
+    edits = Edits(move, swap, remove, add, save)
+    edits.refuse_taken(overwrite)
+    read = read_scene(scene, asset_root, variant, time, untrusted)
+    edited = edit(read, edits, receivers, overwrite)
     import torch
 
     from rfsg.tracer import simulate as tracer
@@ -129,7 +152,7 @@ def simulate(
         responses = report.response_arrays(
             result, bandwidth, snapshots=snapshots, duration_s=duration, **band
         )
-    asked = asked_of_scene(scene, move, replace, without, asset_root, variant, time)
+    asked = asked_of_scene(scene, edits, asset_root, variant, time)
     asked |= {"seed": seed, "device": device, "receivers_file": receivers and str(receivers)}
     asked |= {"bandwidth_hz": bandwidth, "snapshots": snapshots, "duration_s": duration, **band}
     asked |= {} if choice is None else {"dial": choice}
@@ -140,6 +163,7 @@ def simulate(
         report.write_channel(result, folder / "channel.npz", responses)
         report.write_json(report.report(result, **asked), folder / "report.json")
         _draw(edited, result, chosen, folder, title=scene.name)
+        _write_layouts(result, channel, folder)
     _print_links(result)
     from rfsg.tracer.mimo import plane_wave_warnings
 
@@ -175,6 +199,15 @@ def _draw(
     figure = plot.scene_figure(scene, result.paths, result.channel, title)
     plot.save(figure, folder / "scene.png")
     plot.save(plot.delay_figure(scene, result.channel, links), folder / "pdp.png")
+
+
+def _write_layouts(result: "Result", layouts: list[Layout], folder: Path) -> None:
+    from rfsg import interchange
+
+    if Layout.sionna in layouts:
+        interchange.write_sionna(result, folder / "cir.npz")
+    if Layout.deepmimo in layouts:
+        interchange.write_deepmimo(result, folder / "deepmimo")
 
 
 def _print_links(result: "Result") -> None:

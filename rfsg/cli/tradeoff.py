@@ -10,6 +10,7 @@ import typer
 
 from rfsg.cli.options import (
     Accuracy,
+    Additions,
     Changes,
     Device,
     Frequency,
@@ -19,14 +20,15 @@ from rfsg.cli.options import (
     Preset,
     Receivers,
     Removals,
-    Replacements,
     Roots,
+    Save,
     SceneFile,
+    Swaps,
     Time,
     Variants,
 )
 from rfsg.cli.parse import parse_budget, parse_quality
-from rfsg.cli.scenes import asked_of_scene, device_named, edit, read_scene
+from rfsg.cli.scenes import Edits, asked_of_scene, device_named, edit, read_scene
 from rfsg.cli.terminal import bar, note, print_files, print_table
 
 if TYPE_CHECKING:
@@ -63,8 +65,10 @@ def tradeoff(
     quality: Preset = "standard",
     changes: Changes = [],
     move: Moves = [],
-    replace: Replacements = [],
-    without: Removals = [],
+    swap: Swaps = [],
+    remove: Removals = [],
+    add: Additions = [],
+    save: Save = None,
     receivers: Receivers = None,
     asset_root: Roots = [],
     variant: Variants = [],
@@ -83,7 +87,10 @@ def tradeoff(
 
     base = parse_quality(quality, changes)
     report.refuse_taken(out, overwrite)
-    edited = edit(read_scene(scene, asset_root, variant, time), move, replace, without, receivers)
+    edits = Edits(move, swap, remove, add, save)
+    edits.refuse_taken(overwrite)
+    read = read_scene(scene, asset_root, variant, time)
+    edited = edit(read, edits, receivers, overwrite)
     from rfsg.tracer import tradeoff as measuring
 
     options: dict[str, Any] = {} if accuracy is None else {"accuracy_db": accuracy}
@@ -98,7 +105,7 @@ def tradeoff(
             progress=progress,
             **options,
         )
-    asked = asked_of_scene(scene, move, replace, without, asset_root, variant, time)
+    asked = asked_of_scene(scene, edits, asset_root, variant, time)
     asked |= {"budget_s": budget, "grid": grid.value, "base": base, "device": device}
     from rfsg import plot
     from rfsg.plot_tradeoff import tradeoff_figure

@@ -112,7 +112,7 @@ def learn_shape_file(
         "source": mesh_path.name,
         "source_sha256": hashlib.sha256(mesh_path.read_bytes()).hexdigest(),
         "repairs": notes,
-        "report": {k: _short(v) for k, v in asdict(report).items()},
+        "report": {k: rounded(v) for k, v in asdict(report).items()},
     }
     if surface is None:
         surface = StochasticSurface()
@@ -545,5 +545,6 @@ def _under(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
-def _short(value: float | int) -> float | int:
+def rounded(value: float | int) -> float | int:
+    """A number of a report to four digits, as provenance holds it."""
     return float(f"{value:.4g}") if isinstance(value, float) else value

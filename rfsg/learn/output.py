@@ -71,6 +71,7 @@ def save_assets(folder: Path, fitted: "Fitted", selection: Selection) -> Scene:
         if body.shape.kind != "neural" and body.surface.kind != "stochastic":
             continue  # known shapes and materials are written into the scene itself
         if id(body) not in files:
+            body.band = _band(fitted)
             folder.mkdir(exist_ok=True)
             name = nodes[i].path.rsplit("/", 1)[-1]
             taken = {f.stem for f in files.values()}
@@ -84,6 +85,12 @@ def save_assets(folder: Path, fitted: "Fitted", selection: Selection) -> Scene:
     return replace(scene, nodes=tuple(nodes))
 
 
+def _band(fitted: "Fitted") -> tuple[float, float]:
+    """The lowest and highest frequency of the readings [Hz]: where what was learned is known."""
+    heard = fitted.report["frequency_hz"]
+    return min(heard), max(heard)
+
+
 def to_json(report: dict[str, Any]) -> bytes:
     """Strict JSON: no NaN, no infinity."""
     return (json.dumps(_finite(report), indent=2, allow_nan=False) + "\n").encode()
@@ -91,12 +98,11 @@ def to_json(report: dict[str, Any]) -> bytes:
 
 def _provenance(fitted: "Fitted", path: str) -> dict[str, Any]:
     report = fitted.report
-    frequency = report["frequency_hz"]
     return {
         "learned_from": f"{report['readings']['train']} readings"
         + (f" of {Path(report['source']).name}" if report["source"] else ""),
         "learned": [row["parameter"] for row in report["selected"] if path in _of(row)],
-        "frequency_band_hz": [min(frequency), max(frequency)],
+        "frequency_band_hz": list(_band(fitted)),
         "train": report["train"]["after"],
         "validation": report["validation"]["after"],
         "steps": report["steps"],

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from rfsg.learn.errors import LearnError
 from rfsg.objects.body import Body
+from rfsg.objects.physics.transport import gradient_norm
+from rfsg.objects.shapes.neural import NeuralShape
 from rfsg.objects.surfaces.stochastic import StochasticSurface
 
 STENCIL = 0.02  # of the half diagonal: the step of the discrete Laplacian
@@ -23,7 +25,7 @@ STENCIL = 0.02  # of the half diagonal: the step of the discrete Laplacian
 class Regularisation:
     """Weights of the terms (0 leaves one out), and how many points each object is asked.
 
-    every: steps from one asking to the next. They are 30 % of a step's time; asked more rarely and so
+    every: steps from one asking to the next. They are a quarter of a step's work; asked more rarely and so
     many times as strongly, what they ask for is the same in the mean.
     """
 
@@ -52,6 +54,24 @@ def random_points(body: Body, count: int, generator: torch.Generator) -> Float[T
     return low + (high - low) * share
 
 
+def regularised(
+    body: Body, point: Float[Tensor, "n 3"], how: Regularisation, *, shape: bool, surface: bool
+) -> Float[Tensor, ""]:
+    """Both terms at points [m] with their weights; shape, surface: what of the object is learned.
+
+    The eikonal term asks for slopes where the Laplacian has its middles: one sweep answers both.
+    """
+    total = point.new_zeros(())
+    if not how.laplacian:
+        return how.eikonal * eikonal(body, point) if how.eikonal and shape else total
+    around = stencil(body, point)
+    said = _Said.of(body, around, slope=shape and how.eikonal > 0, value=shape, feature=surface)
+    total = how.laplacian * _laplacian(body, around, said)
+    if said.gradient is not None:
+        total = total + how.eikonal * _off_unit(said.gradient[:, 0])
+    return total
+
+
 def laplacian(
     body: Body, point: Float[Tensor, "n 3"], *, shape: bool, surface: bool
 ) -> Float[Tensor, ""]:
@@ -59,26 +79,69 @@ def laplacian(
 
     shape, surface: whether f, and the fields, are asked. Lengths in half diagonals of the bounds.
     """
-    low, high = body.shape.bounds().to(point)
-    half = 0.5 * (high - low).norm()
-    step = STENCIL * half
-    away = step * torch.cat([torch.eye(3), -torch.eye(3)]).to(point)
-    around = torch.cat([point[:, None], point[:, None] + away], 1)
-    values = []
-    if shape:
-        values.append(body.shape.sdf(around) / half)
-    if surface and isinstance(body.surface, StochasticSurface):
-        values += [field for field in body.surface.fields(body.shape, around) if field is not None]
-    total = point.new_zeros(())
-    for value in values:
-        total = total + ((value[:, 1:].sum(1) - 6.0 * value[:, 0]) / STENCIL**2).abs().mean()
-    return total
+    around = stencil(body, point)
+    return _laplacian(body, around, _Said.of(body, around, value=shape, feature=surface))
 
 
 def eikonal(body: Body, point: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     """Mean of (|grad f| - 1)^2."""
-    _, gradient = body.shape.value_and_gradient(point)
-    square = (gradient * gradient).sum(-1)
-    zero = square == 0
-    size = torch.where(zero, torch.zeros_like(square), torch.where(zero, 1.0, square).sqrt())
-    return ((size - 1.0) ** 2).mean()
+    return _off_unit(body.shape.value_and_gradient(point)[1])
+
+
+def stencil(body: Body, point: Float[Tensor, "n 3"]) -> Float[Tensor, "n 7 3"]:
+    """Each point, and those a step away from it both ways along each axis [m]."""
+    eye = torch.eye(3, dtype=point.dtype)
+    away = torch.cat([torch.zeros_like(eye[:1]), eye, -eye])
+    return point[:, None] + STENCIL * _half_diagonal(body) * away
+
+
+@dataclass(frozen=True)
+class _Said:
+    """What an object says of points: f [m] and its gradient, and the fields; None was not asked."""
+
+    value: Float[Tensor, "n 7"] | None = None
+    gradient: Float[Tensor, "n 7 3"] | None = None
+    fields: tuple[Float[Tensor, "n 7"], ...] = ()
+
+    @staticmethod
+    def of(
+        body: Body,
+        point: Float[Tensor, "n 7 3"],
+        *,
+        value: bool,
+        feature: bool,
+        slope: bool = False,
+    ) -> "_Said":
+        """In one sweep of the shape, where it can tell all at once."""
+        f = g = h = None
+        surface = body.surface if feature else None
+        learned = surface if isinstance(surface, StochasticSurface) else None
+        if value and learned and isinstance(body.shape, NeuralShape):
+            f, g, h = body.shape.value_gradient_feature(point)
+        elif slope:
+            f, g = body.shape.value_and_gradient(point)
+        elif value:
+            f = body.shape.sdf(point)
+        fields = learned.fields(body.shape, point, h) if learned else ()
+        return _Said(f, g if slope else None, tuple(x for x in fields if x is not None))
+
+
+def _laplacian(body: Body, around: Float[Tensor, "n 7 3"], said: _Said) -> Float[Tensor, ""]:
+    values = (
+        said.fields if said.value is None else (said.value / _half_diagonal(body), *said.fields)
+    )
+    if not values:
+        return around.new_zeros(())
+    each = torch.stack(values)
+    bent = (each[..., 1:].sum(-1) - 6.0 * each[..., 0]) / STENCIL**2
+    return bent.abs().mean(-1).sum()
+
+
+def _off_unit(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    return ((gradient_norm(gradient) - 1.0) ** 2).mean()
+
+
+def _half_diagonal(body: Body) -> float:
+    """Of the object's bounds [m]."""
+    low, high = body.shape.bounds().tolist()
+    return 0.5 * math.dist(low, high)

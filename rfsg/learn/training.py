@@ -26,7 +26,7 @@ from rfsg.learn.links import Links
 from rfsg.learn.losses import Losses, Predicted, loss, residual_db
 from rfsg.learn.measurements import Measurements, Quantity
 from rfsg.learn.predict import predict_all, predict_rows
-from rfsg.learn.regularisation import Regularisation, eikonal, laplacian, random_points
+from rfsg.learn.regularisation import Regularisation, random_points, regularised
 from rfsg.learn.selection import Selection
 from rfsg.objects.body import Body
 from rfsg.scene.scene import Scene
@@ -223,10 +223,7 @@ class Training:
         generator = _generator(self.settings.seed + 1, step)
         for body, shape, surface in self.asked:
             point = random_points(body, how.points, generator).float()
-            if how.laplacian:
-                total = total + how.laplacian * laplacian(body, point, shape=shape, surface=surface)
-            if how.eikonal and shape:
-                total = total + how.eikonal * eikonal(body, point)
+            total = total + regularised(body, point, how, shape=shape, surface=surface)
         return how.every * total
 
     def _gradients(self, total: Tensor) -> list[Tensor]:

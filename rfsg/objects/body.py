@@ -8,15 +8,19 @@ from rfsg.objects.physics.lobes import Scattering
 
 
 class Body(nn.Module):
-    """A shape joined with a surface; see ``rfsg.objects.contract`` for what each answers."""
+    """A shape joined with a surface; see ``rfsg.objects.contract`` for what each answers.
+
+    band: lowest and highest frequency [Hz] that it was learned at; None where that says nothing
+    of it, as for known materials."""
 
     shape: Shape
     surface: Surface
 
-    def __init__(self, shape: Shape, surface: Surface):
+    def __init__(self, shape: Shape, surface: Surface, band: tuple[float, float] | None = None):
         super().__init__()
         self.shape = shape
         self.surface = surface
+        self.band = band
 
     def reflection(
         self, contact: Contact, frequency: Float[Tensor, "f"]

@@ -50,6 +50,10 @@ class Field:
         return None if isinstance(value, wanted) else f"a value of type {self.kind}"
 
 
+BAND = (  # what the object was learned at; beyond is extrapolation
+    Field("rfsg:band:minHz", "double", positive=True),
+    Field("rfsg:band:maxHz", "double", positive=True),
+)
 NEURAL = (
     Field("rfsg:neural:weights", "asset"),
     Field("rfsg:neural:formatVersion", "int", fallback=FORMAT_VERSION),
@@ -58,6 +62,7 @@ NEURAL = (
     Field("rfsg:neural:boundsMax", "float3"),
     Field("rfsg:neural:lipschitz", "double", positive=True),
     Field("rfsg:neural:provenance", "string", fallback="{}"),
+    *BAND,
 )
 MATERIAL = (
     Field("rfsg:material:model", "token", tokens=MODELS),

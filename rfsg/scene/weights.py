@@ -1,7 +1,8 @@
 """A body as the bytes of a safetensors file, and back: same bits, no pickle, nothing trusted.
 
 The file holds the tensors ``shape.*`` and ``surface.*`` and one metadata entry, ``rfsg``: JSON with
-the format version and, for shape and surface, the kind token and the constructor's arguments.
+the format version and, for shape and surface, the kind token and the constructor's arguments; of a
+mesh these are arrays, and stand among the tensors.
 """
 
 import hashlib
@@ -12,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
@@ -21,6 +23,7 @@ from torch import Tensor, nn
 from rfsg.objects.body import Body
 from rfsg.objects.catalogue import shape_class, surface_class
 from rfsg.objects.shapes.presence import absence
+from rfsg.objects.shapes.topology import MAX_TRIANGLES
 from rfsg.scene.files import outer_file
 from rfsg.scene.scene import SceneError
 
@@ -29,23 +32,28 @@ MAX_WEIGHTS_BYTES = (
     256 * 2**20
 )  # the paper's networks take 2 MB; this bounds what a stranger's take
 MAX_HEADER_BYTES = 2**20
+MAX_ROWS = 3 * MAX_TRIANGLES  # of a mesh's arrays
 MAX_DECLARED = 1024  # largest width or depth that a file may declare
 MAX_DECLARED_ELEMENTS = (
     2**26
 )  # width^2 times depth, with the two largest declared numbers as widths
 _FLOATS = (torch.float32, torch.float64)
+ARRAYS = {"mesh": {"vertices": torch.float64, "triangles": torch.int64}}  # arguments that are [n 3]
 
 
 def pack(body: Body) -> bytes:
     """The body's architecture and tensors as safetensors bytes; equal bodies give equal bytes."""
     head: dict[str, Any] = {"formatVersion": FORMAT_VERSION}
+    tensors: dict[str, Tensor] = {}
     for part, module in _parts(body):
-        head[part] = {"kind": module.kind, "config": module.config()}
-    tensors = {
-        f"{part}.{name}": tensor.detach().cpu().contiguous().clone()
-        for part, module in _parts(body)
-        for name, tensor in module.state_dict().items()
-    }
+        config = dict(module.config())
+        given = {
+            name: torch.tensor(config.pop(name), dtype=dtype)
+            for name, dtype in ARRAYS.get(module.kind, {}).items()
+        }
+        head[part] = {"kind": module.kind, "config": config}
+        for name, tensor in (module.state_dict() | given).items():
+            tensors[f"{part}.{name}"] = tensor.detach().cpu().contiguous().clone()
     # one metadata entry only: the order of several is not fixed, and the bytes are hashed
     return save_tensors(tensors, metadata={"rfsg": json.dumps(head, sort_keys=True)})
 
@@ -66,8 +74,9 @@ def unpack(data: bytes, where: str, file: str | None = None) -> Body:
     parts, faults = {}, []
     for part, class_of in (("shape", shape_class), ("surface", surface_class)):
         try:
-            module = _build(class_of, head.get(part), f"{where}: {part}")
-            faults += _fill(module, part, tensors, where)
+            arrays = _arrays(head.get(part), part, tensors, where)
+            module = _build(class_of, head.get(part), arrays, f"{where}: {part}")
+            faults += _fill(module, part, tensors, set(arrays), where)
             parts[part] = module
         except SceneError as error:
             faults += error.faults
@@ -147,13 +156,40 @@ def _head(data: bytes, where: str) -> dict[str, Any]:
     return head
 
 
-def _build(class_of: Callable[[str], type], declared: Any, where: str) -> nn.Module:
+def _arrays(
+    declared: Any, part: str, tensors: dict[str, Tensor], where: str
+) -> dict[str, np.ndarray]:
+    """The constructor's arguments that stand among the tensors; none where the header holds all, as
+    in older files of small meshes."""
+    said = declared if isinstance(declared, dict) else {}
+    config = said.get("config")
+    wanted = ARRAYS.get(str(said.get("kind")), {}) if isinstance(config, dict) else {}
+    arrays = {}
+    for name, dtype in wanted.items():
+        if name in (config or {}):
+            continue
+        given, what = tensors.get(f"{part}.{name}"), f"{where}: tensor {f'{part}.{name}'!r}"
+        if given is None:
+            raise SceneError([f"{what} is missing"])
+        if given.dtype != dtype or given.ndim != 2 or given.shape[1] != 3:
+            raise SceneError(
+                [f"{what} is {given.dtype} {list(given.shape)}; expected {dtype} [n, 3]"]
+            )
+        if len(given) > MAX_ROWS:
+            raise SceneError([f"{what} has {len(given)} rows; the limit is {MAX_ROWS}"])
+        arrays[name] = given.numpy()
+    return arrays
+
+
+def _build(
+    class_of: Callable[[str], type], declared: Any, arrays: dict[str, np.ndarray], where: str
+) -> nn.Module:
     if not isinstance(declared, dict) or not isinstance(declared.get("config"), dict):
         raise SceneError([f"{where}: metadata declares no kind and config"])
     kind, config = declared.get("kind"), declared["config"]
     _bound(config, where)
     try:
-        return class_of(str(kind))(**config)
+        return class_of(str(kind))(**config, **arrays)
     except Exception as error:  # the arguments are a stranger's: any refusal is the file's fault
         raise SceneError(
             [f"{where}: kind {kind!r} cannot be built from its config {config}: {error}"]
@@ -182,19 +218,22 @@ def _numbers(value: Any) -> Iterator[int | float]:
         yield value
 
 
-def _fill(module: nn.Module, part: str, tensors: dict[str, Tensor], where: str) -> list[str]:
-    """Load ``part.*`` into the module; returns the faults and loads nothing when there are any."""
-    wanted = {f"{part}.{k}": v for k, v in module.state_dict().items()}
+def _fill(
+    module: nn.Module, part: str, tensors: dict[str, Tensor], built: set[str], where: str
+) -> list[str]:
+    """Load ``part.*`` into the module, but for what it was ``built`` from; returns the faults and
+    loads nothing when there are any."""
+    wanted = {f"{part}.{k}": v for k, v in module.state_dict().items() if k not in built}
     given = {k: v for k, v in tensors.items() if k.startswith(f"{part}.")}
+    given = {k: v for k, v in given.items() if k[len(part) + 1 :] not in built}
     faults = [f"{where}: tensor {k!r} is missing" for k in sorted(wanted.keys() - given.keys())]
     faults += [f"{where}: tensor {k!r} is unknown" for k in sorted(given.keys() - wanted.keys())]
     for name in sorted(wanted.keys() & given.keys()):
         faults += _compare(name, wanted[name], given[name], where)
     if not faults:
         # assign keeps the file's precision; clone, since the file's buffer may not be aligned
-        module.load_state_dict(
-            {k[len(part) + 1 :]: v.clone() for k, v in given.items()}, assign=True
-        )
+        loaded = {k[len(part) + 1 :]: v.clone() for k, v in given.items()}
+        module.load_state_dict(loaded, assign=True, strict=not built)
     return faults
 
 

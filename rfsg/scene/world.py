@@ -8,6 +8,7 @@ in float32.
 import json
 import math
 from collections.abc import Callable, Iterator
+from copy import copy
 from functools import cached_property
 from typing import Any
 
@@ -18,6 +19,7 @@ from torch import Tensor, nn
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Contact, Crossing, Jet, Shape
 from rfsg.objects.shapes.analytic import Box, Boxes, HalfSpace
+from rfsg.objects.shapes.sketch import Sketched, sketch_of
 from rfsg.objects.surfaces.interface import Known
 from rfsg.objects.surfaces.solid import PARALLEL, Backed, Solid, depth_behind, stretched
 from rfsg.scene.scene import Scene
@@ -76,6 +78,19 @@ class World:
 
     def __len__(self) -> int:
         return len(self.scene.nodes)
+
+    def sketched(self, error: float) -> "World":
+        """The same scene for rough answers: networks whose sketches err by less than ``error`` [m] give
+        f and its gradient by those (``objects.shapes.sketch``). Itself where there are none."""
+        rough, changed = copy(self), False
+        rough.shapes = list(self.shapes)
+        for k, shape in enumerate(self.shapes):
+            if shape is None:  # the boxes
+                continue
+            found, scale = sketch_of(shape), float(self.scale[self.shape_of_node == k].max())
+            if found is not None and found.error * scale < error:
+                rough.shapes[k], changed = Sketched(shape, found), True
+        return rough if changed else self
 
     def _flags(self, question: Callable[[Body], bool]) -> Bool[Tensor, "n"]:
         answers = [bool(question(n.body)) for n in self.scene.nodes]

@@ -16,6 +16,7 @@ from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.band import Baked
 
 AT_ONCE = 2_048  # points asked of the network at once: a few rays look several least steps ahead
+DOUBLED = 4  # steps after which those left look twice as far ahead, once most have arrived
 MOST_AHEAD = 32
 WIDER = 2e-6  # [m] more than float32 rounds a length of 10 m by
 RESTING = 0.85  # compact the march when this share of its rays, or less, is still under way
@@ -44,8 +45,13 @@ def bracketed(
     end: Float[Tensor, "m"],
     floor: float,
     most: int,
+    ahead: int = 0,
 ) -> Brackets:
-    """The first ``most`` sign changes on each ray, 0 <= t <= end [m], searched in float32."""
+    """The first ``most`` sign changes on each ray, 0 <= t <= end [m], searched in float32.
+
+    ahead: least steps looked ahead, at first; if given, what is found on a ray does not depend on how
+    many others there are, which suits short stretches.
+    """
     start, direction, end = start.float(), direction.float(), end.float()
     count = torch.zeros(len(end), dtype=torch.int64, device=end.device)
     value, bound, way = signed(shape, baked, start, direction)
@@ -53,16 +59,18 @@ def bracketed(
     found: list[tuple[Tensor, ...]] = []
     row = torch.nonzero(end > 0).squeeze(-1)
     state = _take((start, direction, end, torch.zeros_like(end), value, bound, way), row)
+    steps = 0
     while len(row):
         p0, d, last, t, value, bound, way = state
         first = t + torch.maximum(_step(baked, bound), way).clamp_(min=floor)
-        more = min(max(AT_ONCE // len(row), 1), MOST_AHEAD)
+        more = ahead * 2 ** max(steps // DOUBLED - 2, 0) or max(AT_ONCE // len(row), 1)
+        more, steps = min(more, MOST_AHEAD), steps + 1
         along = first[:, None] + floor * torch.arange(more, device=t.device)
         along = torch.minimum(along, last[:, None])
         point = torch.addcmul(p0[:, None], along[..., None], d[:, None])
         looked = signed(shape, baked, point.view(-1, 3), d.repeat_interleave(more, 0))
-        ahead, bounds, ways = (x.view(along.shape) for x in looked)
-        t, value = torch.cat([t[:, None], along], 1), torch.cat([value[:, None], ahead], 1)
+        there, bounds, ways = (x.view(along.shape) for x in looked)
+        t, value = torch.cat([t[:, None], along], 1), torch.cat([value[:, None], there], 1)
         flip = (value[:, 1:] < 0) != (value[:, :-1] < 0)
         i, k = torch.nonzero(flip, as_tuple=True)
         if len(i):

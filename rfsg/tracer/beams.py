@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from rfsg.tracer.faces import Planes
-from rfsg.tracer.sequences import Prefixes
+from rfsg.tracer.prefixes import Prefixes
 
 WIDER = 1e-6  # [m] intervals hold this much more than is lit: the vertices decide
 INEQUALITIES = 4_000_000  # at a time

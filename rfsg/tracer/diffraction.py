@@ -26,8 +26,8 @@ from rfsg.tracer.faces import Planes, planes_of
 from rfsg.tracer.images import fold, images_of
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.records import Act, Found, Paths, Status
-from rfsg.tracer.sequences import Budget, Prefixes, TooMany, levels
+from rfsg.tracer.prefixes import Budget, Prefixes, TooMany, levels
+from rfsg.tracer.records import Act, Failed, Found, Only, Paths, Status
 from rfsg.tracer.solve import COINCIDENT
 
 ROUNDS = 30  # Newton steps; the length is convex along straight edges
@@ -61,34 +61,42 @@ def paths_of(
     rx: Float[Tensor, "r 3"],
     wavelength: float,
     quality: Quality,
+    only: Only | None = None,
 ) -> Found:
     """Every path round one edge, with up to ``diffraction_depth - 1`` planar mirrors before and after
-    it, and with ``diffraction=2`` round two straight edges without mirrors.
+    it, and with ``diffraction=2`` round two straight edges without mirrors. only: which of them, if
+    not all.
 
     Differentiable in poses, sizes and positions.
     """
     if not len(edges):
         return Found(left_out=("edge diffraction: no object has an edge that stands free",))
+    said = f"edge diffraction round up to {quality.diffraction} of {len(edges)} edges"
+    if only is not None and not any(
+        bool(x.any()) for x in (only.node, only.tx, only.rx, only.edge)
+    ):
+        return Found(modelled=(said,))
     planes = planes_of(world)
     found: list[Paths] = []
+    failed: list[Failed] = []
     counts: Counter[Status] = Counter()
     left_out: list[str] = []
     for stage in (_one_edge, _mirrors_and_an_edge, _two_edges):
         try:
-            for bends in stage(planes, edges, tx, rx, quality):
+            for bends in stage(planes, edges, tx, rx, quality, only):
                 for i in torch.arange(len(bends.tx), device=tx.device).split(quality.chunk):
                     paths = _exact(world, planes, edges, bends.take(i), tx, rx, wavelength)
-                    for status in paths.status.tolist():
-                        counts[Status(status)] += 1
+                    number = torch.bincount(paths.status, minlength=len(Status)).tolist()
+                    counts.update({s: number[s] for s in Status if number[s]})
                     good = paths.status <= int(Status.CAUSTIC_CAPPED)
                     found.append(paths.take(torch.nonzero(good).squeeze(-1)))
+                    failed.append(Failed.of(paths))
         except TooMany:
             left_out.append(
                 f"diffraction, {_WHAT[stage]}: {len(edges)} edges, {len(tx)} transmitters and "
                 f"{len(rx)} receivers have too many combinations; ask for fewer receivers at a time"
             )
-    said = f"edge diffraction round up to {quality.diffraction} of {len(edges)} edges"
-    return Found(tuple(found), dict(counts), (said,), tuple(left_out))
+    return Found(tuple(found), dict(counts), (said,), tuple(left_out), tuple(failed))
 
 
 # the search: which mirrors and edges, without gradients. Each stage is done whole or not at all, so
@@ -97,34 +105,50 @@ def paths_of(
 
 @torch.no_grad()
 def _one_edge(
-    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality, only: Only | None
 ) -> list[Bends]:
     """Round one edge, no mirrors."""
     if not (len(edges) and quality.diffraction):
         return []
-    fore, t = _stack([levels(planes, p, 0, Budget(MOST_PAIRS))[0] for p in tx])
-    aft, r = _stack([levels(planes, p, 0, Budget(MOST_PAIRS))[0] for p in rx])
-    return _bends(edges, fore, t, aft, r, Budget(MOST_PAIRS))
+    budget = Budget(MOST_PAIRS)
+    (fore,), (aft,) = (_prefixes(planes, ends, 0, budget) for ends in (tx, rx))
+    return _bends(planes, edges, fore, aft, budget, only)
 
 
 @torch.no_grad()
 def _mirrors_and_an_edge(
-    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality, only: Only | None
 ) -> list[Bends]:
     """Round one edge, with planar mirrors before it and after it."""
     mirrors = max(0, min(quality.depth, quality.diffraction_depth) - 1)
     if not (len(edges) and quality.diffraction and mirrors):
         return []
     budget = Budget(MOST_PAIRS)
-    ahead = [levels(planes, p, mirrors, budget) for p in tx]
-    behind = [levels(planes, p, mirrors, budget) for p in rx]
+    ahead, behind = (_prefixes(planes, ends, mirrors, budget) for ends in (tx, rx))
     found: list[Bends] = []
     for i in range(mirrors + 1):
         for j in range(mirrors + 1 - i):
             if i + j:
-                fore, t = _stack([level[i] for level in ahead])
-                aft, r = _stack([level[j] for level in behind])
-                found += _bends(edges, fore, t, aft, r, budget)
+                found += _bends(planes, edges, ahead[i], behind[j], budget, only)
+    return found
+
+
+def _prefixes(
+    planes: Planes, points: Float[Tensor, "n 3"], mirrors: int, budget: Budget
+) -> list[tuple[Prefixes, Int[Tensor, "p"]]]:
+    """Sequences of 0, 1, ... mirrors seen from points, and whose each is; up to one of all at a time."""
+    if mirrors > 1:
+        each = [levels(planes, p, mirrors, budget) for p in points]
+        return [_stack([level[i] for level in each]) for i in range(mirrors + 1)]
+    owner = torch.arange(len(points), device=points.device)
+    found = [(Prefixes(points, owner[:, None][:, :0]), owner)]
+    if mirrors:
+        budget.spend(len(points) * len(planes))
+        front = points @ planes.normal.T - planes.offset > 0
+        owner, face = torch.nonzero(front, as_tuple=True)
+        height = (points[owner] * planes.normal[face]).sum(-1) - planes.offset[face]
+        image = points[owner] - 2.0 * height[:, None] * planes.normal[face]
+        found.append((Prefixes(image, face[:, None]), owner))
     return found
 
 
@@ -135,21 +159,51 @@ def _stack(parts: list[Prefixes]) -> tuple[Prefixes, Int[Tensor, "p"]]:
 
 
 def _bends(
-    edges: Edges, fore: Prefixes, t: Tensor, aft: Prefixes, r: Tensor, budget: Budget
+    planes: Planes,
+    edges: Edges,
+    ends: tuple[Prefixes, Int[Tensor, "p"]],
+    others: tuple[Prefixes, Int[Tensor, "q"]],
+    budget: Budget,
+    only: Only | None,
 ) -> list[Bends]:
-    """Images at both ends of every edge: in closed form where it is straight, looked up on a rim."""
+    """Images at both ends of every edge: in closed form where it is straight, looked up on a rim.
+
+    ends, others: prefixes of the transmitters and of the receivers, and whose each is.
+    """
+    (fore, t), (aft, r) = ends, others
     found = []
-    p, q = len(fore.image), len(aft.image)
-    budget.spend(p * q * len(edges))
-    for some in torch.arange(len(edges), device=t.device).split(64):
-        own = edges.take(some)
-        for a in torch.arange(p, device=t.device).split(max(1, 2_000_000 // (64 * max(q, 1)))):
-            row, column, e, place = _stationary(own, fore.image[a], aft.image)
-            ahead = a[row]
-            faces = (fore.faces[ahead], aft.faces[column])
-            edge = some[e][:, None]
-            found.append(Bends(t[ahead], r[column], faces[0], edge, place[:, None], faces[1]))
+    budget.spend(len(t) * len(r) * len(edges))
+    for each, ahead, behind in _wanted(planes, edges, ends, others, only):
+        most = max(1, 2_000_000 // (64 * max(len(behind), 1)))
+        for some in each.split(64):
+            own = edges.take(some)
+            for a in ahead.split(most):
+                row, column, e, place = _stationary(own, fore.image[a], aft.image[behind])
+                i, j, edge = a[row], behind[column], some[e][:, None]
+                found.append(Bends(t[i], r[j], fore.faces[i], edge, place[:, None], aft.faces[j]))
     return found
+
+
+def _wanted(
+    planes: Planes,
+    edges: Edges,
+    ends: tuple[Prefixes, Tensor],
+    others: tuple[Prefixes, Tensor],
+    only: Only | None,
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Blocks (edges, prefixes, prefixes) that hold all that is asked for, each once."""
+    device = edges.node.device
+    every = [torch.arange(len(x), device=device) for x in (edges.node, ends[1], others[1])]
+    if only is None:
+        return [(every[0], every[1], every[2])]
+    fore, aft = (
+        radio[owner] | only.node[planes.node[prefixes.faces]].any(1)
+        for (prefixes, owner), radio in ((ends, only.tx), (others, only.rx))
+    )
+    known = torch.nonzero(~only.edge).squeeze(-1)
+    blocks = [(torch.nonzero(only.edge).squeeze(-1), every[1], every[2])]
+    blocks += [(known, i, j) for i, j in Only.pairs(fore, aft)]
+    return [block for block in blocks if all(map(len, block))]
 
 
 def _stationary(edges: Edges, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -213,7 +267,7 @@ def _on_rims(edges: Edges, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor, Tensor
 
 @torch.no_grad()
 def _two_edges(
-    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality
+    planes: Planes, edges: Edges, tx: Tensor, rx: Tensor, quality: Quality, only: Only | None
 ) -> list[Bends]:
     """Ordered pairs of straight edges: of one object with a face in common, or of two objects."""
     straight = torch.nonzero(edges.straight).squeeze(-1)
@@ -235,6 +289,9 @@ def _two_edges(
         for r in range(len(rx)):
             a, b = torch.nonzero(pairs & seen[0][t][:, None] & seen[1][r][None], as_tuple=True)
             budget.spend(len(a))
+            if only is not None and not bool(only.tx[t] | only.rx[r]):
+                marked = (only.edge[straight[a]] | only.edge[straight[b]]).nonzero().squeeze(-1)
+                a, b = a[marked], b[marked]
             edge = torch.stack([straight[a], straight[b]], 1)
             none = torch.zeros(len(a), 0, dtype=torch.int64, device=tx.device)
             ends = (torch.full_like(a, t), torch.full_like(a, r))
@@ -299,8 +356,11 @@ def _exact(
     length = segments(vertices)[0]
     with torch.no_grad():
         status = torch.where(capped, int(Status.CAUSTIC_CAPPED), int(Status.OK))
-        free = is_free(world, some, t.reshape(-1), wavelength).reshape(c, k).all(1)
-        inside = line.within() & first_on & last_on & free
+        inside = line.within() & first_on & last_on
+        i = torch.nonzero(inside[:, None].expand(c, k).reshape(-1)).squeeze(-1)
+        free = torch.ones(c * k, dtype=torch.bool, device=t.device)
+        free[i] = is_free(world, some.take(i), t.reshape(-1)[i], wavelength)
+        inside &= free.reshape(c, k).all(1)
         status = torch.where(inside, status, int(Status.OFF_SURFACE))
         status = torch.where(settled, status, int(Status.NOT_CONVERGED))
         degenerate = (length <= COINCIDENT).any(1) | (sine <= 0).any(1) | ~torch.isfinite(spread)

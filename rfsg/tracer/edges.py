@@ -105,6 +105,12 @@ def along_face(normal0: Tensor, normal1: Tensor) -> Tensor:
 def edges_in(world: World, wavelength: float) -> Edges:
     """Every edge of the world that stands free somewhere and is a wavelength long or more: what is
     shorter sends no wave of its own that UTD knows. Differentiable in poses and sizes."""
+    every = long_edges(world, wavelength)
+    return every.take(torch.nonzero(stands_free(world, every, wavelength)).squeeze(-1))
+
+
+def long_edges(world: World, wavelength: float) -> Edges:
+    """Every edge a wavelength long or more, free or not, node by node."""
     parts = []
     for k, node in enumerate(world.scene.nodes):
         own = edges_of(node.body.shape)
@@ -135,11 +141,16 @@ def edges_in(world: World, wavelength: float) -> Edges:
     if not parts:
         return _none(world)
     every = Edges(*(torch.cat([getattr(p, n) for p in parts]) for n in Edges.__dataclass_fields__))
-    every = every.take(torch.nonzero(every.length >= LEAST * wavelength).squeeze(-1))
+    return every.take(torch.nonzero(every.length >= LEAST * wavelength).squeeze(-1))
+
+
+@torch.no_grad()
+def stands_free(world: World, every: Edges, wavelength: float) -> Bool[Tensor, "e"]:
+    """Which edges are free somewhere."""
     share = (torch.arange(LOOKS, dtype=torch.float64, device=world.device) + 0.5) / LOOKS
     look = every.take(torch.arange(len(every), device=world.device).repeat_interleave(LOOKS))
     free = is_free(world, look, (every.length[:, None] * share).reshape(-1), wavelength)
-    return every.take(torch.nonzero(free.reshape(-1, LOOKS).any(1)).squeeze(-1))
+    return free.reshape(-1, LOOKS).any(1)
 
 
 def _none(world: World) -> Edges:
@@ -173,10 +184,10 @@ def _inside_another(world: World, node: Tensor, point: Tensor) -> Bool[Tensor, "
     """Points inside an object other than their own."""
     inside = torch.zeros(len(point), dtype=torch.bool, device=point.device)
     for k in range(len(world)):
-        which = torch.full((len(point),), k, dtype=torch.int64, device=point.device)
-        local = world.point_object(which, point)
+        # one frame for all: a gather of frames would cost more than the test
+        local = (point - world.translation[k]) @ world.rotation[k] / world.scale[k]
         low, high = world.bounds_object[k]
         i = torch.nonzero(((local > low) & (local < high)).all(-1) & (node != k)).squeeze(-1)
         if len(i):
-            inside[i] |= world.sdf(which[i], point[i]) < 0
+            inside[i] |= world.sdf(torch.full_like(i, k), point[i]) < 0
     return inside

@@ -13,11 +13,13 @@ from torch import Tensor
 
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Shape
+from rfsg.objects.recent import Recent
 from rfsg.objects.shapes.kept import state_of
 from rfsg.objects.surfaces.interface import Conductor
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World, unit
+from rfsg.tracer.lattice import fibonacci
 from rfsg.tracer.march import MarchOptions, march
 from rfsg.tracer.zone import Facets, joined, measure, take, zone_radius
 
@@ -149,20 +151,13 @@ def samples_of(world: World) -> list[Samples]:
     return out
 
 
-_CACHE: dict[int, tuple[object, Samples]] = {}
 MOST_CACHED = 64
+_SAMPLES: Recent[Samples] = Recent(MOST_CACHED)
 
 
 def _sampled(shape: Shape, device: torch.device) -> Samples:
     """Samples of a shape and of no node, kept while the shape's parameters stay as they are."""
-    state = state_of(shape)
-    kept = _CACHE.get(id(shape))
-    if kept is None or kept[0] != state:
-        if len(_CACHE) >= MOST_CACHED:
-            _CACHE.clear()
-        kept = (state, _sample(shape, device))
-        _CACHE[id(shape)] = kept
-    return kept[1]
+    return _SAMPLES.get(id(shape), state_of(shape), lambda: _sample(shape, device))
 
 
 @torch.no_grad()
@@ -294,19 +289,13 @@ class Looks:
         self.facets = found if self.facets is None else joined(self.facets, found)
 
 
-_LOOKS: dict[tuple[int, float], tuple[object, Looks]] = {}
+_LOOKS: Recent[Looks] = Recent(MOST_CACHED)
 
 
 def looks_at(shape: Shape, device: torch.device, wavelength: float) -> Looks:
     """Looks at a shape, kept like the samples themselves."""
-    key, state = (id(shape), round(wavelength, 9)), state_of(shape)
-    kept = _LOOKS.get(key)
-    if kept is None or kept[0] != state:
-        if len(_LOOKS) >= MOST_CACHED:
-            _LOOKS.clear()
-        kept = (state, Looks(shape, device, wavelength))
-        _LOOKS[key] = kept
-    return kept[1]
+    key = (id(shape), round(wavelength, 9))
+    return _LOOKS.get(key, state_of(shape), lambda: Looks(shape, device, wavelength))
 
 
 def _neighbourhood(point: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
@@ -362,10 +351,7 @@ def _aim(bounds: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     # the plastic number's powers fill the cube evenly (Roberts 2018), the golden angle the sphere
     steps = torch.tensor([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])
     inside = low + torch.frac(0.5 + k[:, None] * steps.to(k)) * (high - low)
-    z = 1.0 - 2.0 * (k + 0.5) / SHOTS
-    angle = torch.pi * (3.0 - 5.0**0.5) * k
-    r = torch.sqrt(1.0 - z * z)
-    origin = centre + reach * torch.stack([r * torch.cos(angle), r * torch.sin(angle), z], -1)
+    origin = centre + reach * fibonacci(SHOTS, bounds.device)
     direction = unit(inside - origin)
     # begin at the bounds: a learned shape says nothing about the space outside them
     safe = torch.where(direction == 0, torch.full_like(direction, 1e-300), direction)

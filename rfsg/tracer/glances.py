@@ -5,6 +5,12 @@ once for all objects that have its shape. Most candidates lie by a sharp edge, w
 glint may be anywhere near; the quadric there sends the path far past the object. ``settle`` gives such
 a candidate up after its own first look. Here it never becomes a chain: between two images one vertex
 is left, on a quadric, and the stationary path is Newton's method in two unknowns.
+
+What may be lost? Planar mirrors unfold exactly, so the stationary place is that of the whole chain, and
+``settle`` begins on the same quadric. Only candidates whose steps have settled are dropped, and only
+past the bounds by more than ``settle`` lets a vertex be from the surface, which lies within them. Both
+then solve the same equations, but a quadric may have several stationary paths and Newton's methods in
+two unknowns and in all of them may end on different ones: that is tested, not proven.
 """
 
 import torch
@@ -33,10 +39,10 @@ def astray(
     fore, aft: the images at either end, in the object's frame.
     """
     start, (low, high) = looks.point[sample], looks.bounds
-    place = stationary(looks.of(sample), start, fore, aft)
+    place, settled = stationary(looks.of(sample), start, fore, aft)
     outside = torch.maximum(low - place, place - high).clamp(min=0.0).norm(dim=-1)
     allowed = PAST * float((high - low).amax()) + STRIDE * (place - start).norm(dim=-1)
-    return (outside > allowed) & torch.isfinite(outside)
+    return settled & (outside > allowed) & torch.isfinite(outside)
 
 
 def stationary(
@@ -44,8 +50,9 @@ def stationary(
     start: Float[Tensor, "m 3"],
     fore: Float[Tensor, "m 3"],
     aft: Float[Tensor, "m 3"],
-) -> Float[Tensor, "m 3"]:
-    """Where on each quadric the path between two points is stationary, or Newton's method has got to."""
+) -> tuple[Float[Tensor, "m 3"], Bool[Tensor, "m"]]:
+    """Where on each quadric the path between two points is stationary, and whether Newton's method has
+    got there."""
     a, b, x = (
         torch.einsum("mij,mj->mi", facets.frame, p - facets.centre) for p in (fore, aft, start)
     )
@@ -57,7 +64,9 @@ def stationary(
         uv[going] += shrink[:, None] * step
         going = going[size > SETTLED]
     place = torch.cat([uv, _height(facets, uv)[0][:, None]], 1)
-    return facets.centre + torch.einsum("mji,mj->mi", facets.frame, place)
+    settled = torch.ones(len(x), dtype=torch.bool, device=x.device)
+    settled[going] = False
+    return facets.centre + torch.einsum("mji,mj->mi", facets.frame, place), settled
 
 
 def _height(facets: Facets, uv: Tensor) -> tuple[Tensor, Tensor]:

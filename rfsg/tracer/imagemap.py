@@ -25,9 +25,10 @@ from rfsg.tracer.faces import Planes, planes_of
 from rfsg.tracer.field import SPEED_OF_LIGHT
 from rfsg.tracer.passages import Passages
 from rfsg.tracer.plan import Quality
+from rfsg.tracer.prefixes import Budget, Prefixes, TooMany, levels
 from rfsg.tracer.records import Chains, Paths
 from rfsg.tracer.seams import coincident
-from rfsg.tracer.sequences import MOST_PAIRS, Budget, Prefixes, TooMany, levels
+from rfsg.tracer.sequences import MOST_PAIRS
 from rfsg.tracer.settle import ON_SURFACE
 from rfsg.tracer.solve import COINCIDENT, GRAZING
 

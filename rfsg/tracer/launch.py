@@ -1,78 +1,101 @@
 """The search: which objects, in which order, may a wave visit between these radios? No gradients.
 
-From each transmitter a Fibonacci lattice of rays. At every boundary that a ray enters, its mirror
-image is a new ray; the ray itself goes straight on. Each ray carries the half-width and divergence of
-the tube it stands for, so a reflected ray knows which receivers its tube may hold; those make
-candidate chains (objects, patches), each kept once with the ray that came closest as its seed.
+Sequences of faces are enumerated (``sequences``) where that is affordable. Elsewhere rays are launched
+from each radio of the side that has fewer, in rounds of as many as all before: the sub-lattices of one
+Fibonacci lattice. At every boundary that a ray enters, its mirror image is a new ray; the ray itself
+goes straight on. Each carries the tube it stands for (``tubes``), so a reflected ray knows which of the
+other side's radios its tube may hold; those make candidate chains (objects, patches), each kept once
+with the ray that came closest as its seed (``candidates``). A round that finds no new one is the last.
 Nothing here decides what a path is worth: ``solve`` and ``field`` do.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
-from rfsg.objects.contract import Contact, Crossing
+from rfsg.objects.contract import Crossing
 from rfsg.objects.shapes.kept import BAKE_AFTER
 from rfsg.scene.world import World
+from rfsg.tracer.bounds import Floor, least_product
+from rfsg.tracer.candidates import Candidacy
 from rfsg.tracer.embree import Proxies
+from rfsg.tracer.faces import planes_of
 from rfsg.tracer.field import SPEED_OF_LIGHT
-from rfsg.tracer.march import MarchOptions, crossings
+from rfsg.tracer.lattice import fibonacci, rounds, spacing
+from rfsg.tracer.march import FORWARD, MarchOptions, crossings
+from rfsg.tracer.places import Places
 from rfsg.tracer.plan import Quality
-from rfsg.tracer.records import Chains, Crossings, Rays
-from rfsg.tracer.sequences import TooMany, enumerate_chains
+from rfsg.tracer.prefixes import TooMany
+from rfsg.tracer.records import Chains, Crossings, Only, Rays
+from rfsg.tracer.sequences import enumerate_chains
+from rfsg.tracer.tubes import Tubes, first_tubes, mirrored
 
-TUBE = 2.0  # tubes this much wider than the lattice's spacing: a ray near an edge speaks for its neighbours
-WIDEST = 1.0  # [rad] a tube bent at a sharp edge diverges no further than this
-STEEPEST = 0.1  # least cosine in the bending of tubes: grazing tubes would widen without end
+
+@dataclass
+class Round:
+    """Rays launched at a time, from all radios together, and the chains that they were the first to
+    meet."""
+
+    rays: int = 0
+    found: int = 0
 
 
 @dataclass
 class SearchReport:
+    """How paths were looked for.
+
+    asked: rays that the quality allows, of which ``rays`` were launched. once: chains of planar mirrors
+    that one ray alone met; once_curved: others. Of those of planar mirrors only the ones that a path
+    can be folded onto count, here and in ``rounds``; of the others all, and most come to nothing.
+    pruned: hits below the power floor, or beginnings of sequences that nothing can lift above it.
+    complete: every sequence of faces was looked at, nothing can be missing. enumerated: sequences
+    were; restricted: to those that were asked for (``Only``).
+    """
+
     rays: int = 0
+    asked: int = 0
     hits: int = 0
-    sequences: int = 0
     candidates: int = 0
-    pruned: int = 0  # hits below the power floor
-    complete: bool = False  # every sequence of faces was looked at: nothing can be missing
+    pruned: int = 0
+    once: int = 0
+    once_curved: int = 0
+    complete: bool = False
+    enumerated: bool = False
+    restricted: bool = False
+    launched_from: str = "transmitters"
     per_depth: list[int] = field(default_factory=list)
+    rounds: list[Round] = field(default_factory=list)
 
     def sentence(self) -> str:
-        """How the paths were looked for, for the report."""
-        if self.complete:
-            return f"search: every sequence of faces, {self.candidates} candidate paths in all"
-        return f"search: {self.rays} rays launched, {self.candidates} candidate paths in all"
+        """How the paths were looked for and what may be missing, for the report."""
+        candidates = f"{self.candidates} candidate paths in all"
+        if self.enumerated:
+            what = "every sequence of faces" + " with at most one curved" * (not self.complete)
+            dropped = f"; {self.pruned} beginnings of sequences cannot reach the power floor"
+            return f"search: {what}, {candidates}{dropped * (self.pruned > 0)}"
+        dropped = f"; {self.pruned} hits below the power floor"
+        return f"search: {self._evidence()}{candidates}{dropped * (self.pruned > 0)}"
 
+    def _evidence(self) -> str:
+        """What each round found, and what another would.
 
-@dataclass
-class Tubes:
-    """Rays under way from one transmitter: geometry, tube, amplitude bound, and their history."""
-
-    rays: Rays
-    width: Float[Tensor, "r"]  # half-width at the origin [m]
-    spread: Float[Tensor, "r"]  # growth of the half-width [m per m]
-    bound: Float[Tensor, "r"]  # amplitude, relative to free space over the same length, at most
-    history: Int[Tensor, "r d 2"]  # (node, patch) of the reflections so far
-    vertices: Float[Tensor, "r d 3"]
-
-    def __len__(self) -> int:
-        return self.width.shape[0]
-
-    def take(self, i: Tensor | slice) -> "Tubes":
-        rays = self.rays.take(i)
-        return Tubes(
-            rays, self.width[i], self.spread[i], self.bound[i], self.history[i], self.vertices[i]
+        Chains that one ray alone met are as many as further rays, as many again, would be the first to
+        meet, on average and at most (Good and Toulmin 1956: n_1 - n_2 + n_3 - ..., where n_k chains
+        were met by k rays; its first term is a bound).
+        """
+        if not self.rounds:
+            return f"{self.rays} rays launched, "
+        rays, found = (
+            " + ".join(str(getattr(r, name)) for r in self.rounds) for name in ("rays", "found")
         )
-
-
-def fibonacci(count: int, device: torch.device | str = "cpu") -> Float[Tensor, "count 3"]:
-    """Nearly even directions on the sphere (Gonzalez 2010, 'Measurement of areas on a sphere')."""
-    i = torch.arange(count, dtype=torch.float64, device=device) + 0.5
-    z = 1.0 - 2.0 * i / count
-    r = torch.sqrt((1.0 - z) * (1.0 + z))
-    angle = torch.pi * (3.0 - 5.0**0.5) * i
-    return torch.stack([r * torch.cos(angle), r * torch.sin(angle), z], -1)
+        curved = f" and {self.once_curved} candidates on curved faces" * (self.once_curved > 0)
+        return (
+            f"{self.rays} of {self.asked} rays launched from the {self.launched_from}, in rounds of "
+            f"{rays} that found {found} chains; as many again may find {self.once} more{curved} (so "
+            "many were met by one ray alone); "
+        )
 
 
 @torch.no_grad()
@@ -83,67 +106,156 @@ def search(
     rx_position: Float[Tensor, "r 3"],
     frequency: Float[Tensor, "f"],
     quality: Quality,
+    only: Only | None = None,
 ) -> tuple[Chains, SearchReport]:
     """Candidate chains between every transmitter and every receiver, direct ones included.
 
-    Enumerated (``sequences``) where that is complete and affordable, else searched by rays. Raises
-    ValueError when an enumeration that was insisted on is too large.
+    Enumerated (``sequences``) where that is complete and affordable, else searched by rays; either
+    way from the side with fewer radios. only: which of the enumerated chains, if not all; rays find
+    all. Raises ValueError when an enumeration that was insisted on is too large.
     """
     report = SearchReport()
     depth = quality.depth if len(world) else 0
     # one curved face in a sequence can be enumerated, several only where there are none
     few = quality.curved < 2 or all(n.body.shape.faceted for n in world.scene.nodes)
-    parts = [_direct(len(tx_position), len(rx_position), depth, world.device)]
+    direct = _direct(len(tx_position), len(rx_position), depth, world.device)
+    ends = tx_position, rx_position
+    chains = None
     if depth and quality.search != "rays" and (few or quality.search == "enumerate"):
         try:
-            wavelength = SPEED_OF_LIGHT / float(frequency[0])  # as ``solve`` measures faces
-            parts.append(enumerate_chains(world, tx_position, rx_position, wavelength, quality))
-            report.complete = few
+            chains = _enumerated(world, *ends, frequency, quality, only, report)
+            report.complete, report.enumerated = few, True
+            if only is not None:
+                direct = direct.take(only.tx[direct.tx] | only.rx[direct.rx])
+                report.restricted = True
         except TooMany:
             if quality.search == "enumerate":
                 raise ValueError(
                     "search='enumerate': the scene has too many sequences of faces at "
                     f"depth {depth}; lower the depth or search by rays"
                 ) from None
-    for t in range(len(tx_position) if depth and len(parts) == 1 else 0):
-        tubes = first_tubes(tx_position[t], quality)
-        report.rays += len(tubes)
-        for _ in range(depth):
-            tubes = _bounce(world, proxies, tubes, frequency, quality, report)
-            report.per_depth.append(len(tubes))
-            if not len(tubes):
-                break
-            parts.append(_receive(tubes, t, rx_position, depth, quality, report))
-    chains = _few_curved(world, Chains.joined(parts), quality)
+    if depth and chains is None:
+        chains = _by_rays(world, proxies, *ends, frequency, quality, report)
+    parts = [direct] if chains is None else [direct, chains]
+    chains = Chains.joined(parts)
+    if len(world) and depth:
+        chains = chains.take(_followed(world, chains.which, chains.patch, quality))
     report.candidates = len(chains.tx)
     return chains, report
 
 
-def _few_curved(world: World, chains: Chains, quality: Quality) -> Chains:
-    """Chains with no more reflections on curved or learned faces than the quality follows."""
-    if not len(world) or not chains.which.numel():
-        return chains
-    planar = world.is_planar(chains.which.clamp(min=0), chains.patch.clamp(min=0))
-    curved = (~planar & (chains.which >= 0)).sum(1)
-    order = (chains.which >= 0).sum(1)
-    few = (curved == 0) | ((curved <= quality.curved) & (order <= quality.curved_depth))
-    return chains.take(torch.nonzero(few).squeeze(-1))
+def _enumerated(
+    world: World,
+    tx_position: Tensor,
+    rx_position: Tensor,
+    frequency: Tensor,
+    quality: Quality,
+    only: Only | None,
+    report: SearchReport,
+) -> Chains:
+    """All sequences of faces, begun from the side with fewer radios."""
+    wavelength = SPEED_OF_LIGHT / float(frequency[0])  # as ``solve`` measures faces
+    floor = Floor.of(world, planes_of(world), frequency, quality)
+    back = len(rx_position) < len(tx_position)
+    ends = (rx_position, tx_position) if back else (tx_position, rx_position)
+    if only is not None and back:
+        only = replace(only, tx=only.rx, rx=only.tx)
+    chains = enumerate_chains(world, *ends, wavelength, quality, only, floor)
+    report.pruned = 0 if floor is None else floor.pruned
+    return turned(chains) if back else chains
 
 
-def first_tubes(position: Float[Tensor, "3"], quality: Quality) -> Tubes:
-    """The lattice of rays from one transmitter."""
-    n, device = quality.rays, position.device
-    direction = fibonacci(n, device)
-    zero = torch.zeros(n, dtype=torch.float64, device=device)
-    spacing = (4.0 * torch.pi / n) ** 0.5
-    return Tubes(
-        Rays(position.expand(n, 3).clone(), direction, zero + torch.inf),
-        zero,
-        zero + spacing,
-        zero + 1.0,
-        torch.zeros(n, 0, 2, dtype=torch.int64, device=device),
-        torch.zeros(n, 0, 3, dtype=torch.float64, device=device),
+def _by_rays(
+    world: World,
+    proxies: Proxies,
+    tx_position: Tensor,
+    rx_position: Tensor,
+    frequency: Tensor,
+    quality: Quality,
+    report: SearchReport,
+) -> Chains:
+    """Chains that rays from the side with fewer radios find."""
+    back = _from_receivers(tx_position, rx_position)
+    sources, targets = (rx_position, tx_position) if back else (tx_position, rx_position)
+    report.launched_from = "receivers" if back else "transmitters"
+    report.asked = quality.rays * len(sources)
+    report.per_depth = [0] * quality.depth
+    places = Places(targets)
+    parts = [_no_chains(quality.depth, world.device)]
+    for t, source in enumerate(sources):
+        found = Candidacy(world, t, source, places, quality.depth)
+        _in_rounds(world, proxies, found, frequency, quality, report)
+        parts += [candidates.chains for candidates in found.found.values()]
+        planar, curved = found.once()
+        report.once += planar
+        report.once_curved += curved
+    chains = Chains.joined(parts)
+    return turned(chains) if back else chains
+
+
+def _in_rounds(
+    world: World,
+    proxies: Proxies,
+    found: Candidacy,
+    frequency: Tensor,
+    quality: Quality,
+    report: SearchReport,
+) -> None:
+    """Launch rays from one radio, round by round, until one finds no new chain or all are launched."""
+    direction = fibonacci(quality.rays, world.device)
+    launched = 0
+    for number, some in enumerate(rounds(quality.rays)):
+        launched += len(direction[some])
+        # the widest tubes first: each round is an even lattice together with those before it
+        tubes = first_tubes(found.source, direction[some], spacing(launched))
+        if number == len(report.rounds):
+            report.rounds.append(Round())
+        this, new = report.rounds[number], 0
+        this.rays += len(tubes)
+        report.rays += len(tubes)
+        for level in range(quality.depth):
+            tubes = _bounce(world, proxies, tubes, frequency, quality, report)
+            report.per_depth[level] += len(tubes)
+            if not len(tubes):
+                break
+            new += found.receive(tubes, spacing(launched))
+        this.found += new
+        if number and not new:
+            break
+
+
+def _from_receivers(tx_position: Float[Tensor, "t 3"], rx_position: Float[Tensor, "r 3"]) -> bool:
+    """Whether rays start at the receivers: the fewer, or of as many those that come first.
+
+    A choice that knows nothing of who sends: both directions of a link launch the same rays.
+    """
+    if len(tx_position) != len(rx_position):
+        return len(rx_position) < len(tx_position)
+    ahead = (rx_position.sum(0) - tx_position.sum(0)) @ tx_position.new_tensor(FORWARD)
+    return bool(ahead < 0)
+
+
+def turned(chains: Chains) -> Chains:
+    """The same chains, each from its other end: transmitters are receivers, and the reverse."""
+    depth = chains.which.shape[1]
+    last = (chains.which >= 0).sum(1, keepdim=True) - 1
+    place = last - torch.arange(depth, device=last.device)
+    there = place >= 0
+    place = place.clamp(min=0)
+    which, patch = (
+        torch.where(there, x.gather(1, place), -1) for x in (chains.which, chains.patch)
     )
+    seed = chains.seed.gather(1, place[..., None].expand_as(chains.seed))
+    return Chains(chains.rx, chains.tx, which, patch, torch.where(there[..., None], seed, 0.0))
+
+
+def _followed(
+    world: World, which: Int[Tensor, "c d"], patch: Int[Tensor, "c d"], quality: Quality
+) -> Bool[Tensor, "c"]:
+    """Sequences with no more reflections on curved or learned faces than the quality follows."""
+    met = which >= 0
+    curved = (met & ~world.is_planar(which.clamp(min=0), patch.clamp(min=0))).sum(1)
+    return (curved == 0) | ((curved <= quality.curved) & (met.sum(1) <= quality.curved_depth))
 
 
 def _bounce(
@@ -158,17 +270,7 @@ def _bounce(
     for begin in range(0, len(tubes), quality.chunk):
         piece = tubes.take(slice(begin, begin + quality.chunk))
         parts.append(_bounce_chunk(world, proxies, piece, frequency, quality, report))
-    return join(parts)
-
-
-def join(parts: list[Tubes]) -> Tubes:
-    if len(parts) == 1:
-        return parts[0]
-    rays = Rays(
-        *(torch.cat([getattr(p.rays, n) for p in parts]) for n in Rays.__dataclass_fields__)
-    )
-    names = ("width", "spread", "bound", "history", "vertices")
-    return Tubes(rays, *(torch.cat([getattr(p, n) for p in parts]) for n in names))
+    return Tubes.joined(parts)
 
 
 def search_options(quality: Quality, rays: int) -> MarchOptions:
@@ -195,12 +297,14 @@ def _bounce_chunk(
     before = amplitude_before(world, tubes.rays, inside, frequency)
     report.hits += len(inside.ray)
     entered = (inside.enter > 0) & (inside.normal_enter.abs().sum(-1) > 0)
-    floor = 10.0 ** (quality.floor_db / 20.0)
+    floor = least_product(world, quality)
     bound = tubes.bound[inside.ray] * before
     strong = bound > floor
     report.pruned += int((entered & ~strong).sum())
     i = torch.nonzero(entered & strong).squeeze(-1)
-    return _reflect(world, tubes, inside, i, bound[i], frequency, floor)
+    grown = mirrored(world, tubes, inside, i, bound[i], frequency, floor)
+    which, patch = grown.history.unbind(-1)
+    return grown.take(torch.nonzero(_followed(world, which, patch, quality)).squeeze(-1))
 
 
 def amplitude_before(
@@ -257,86 +361,6 @@ def transmission_of(
     return world.transmission(which, crossing, frequency)
 
 
-def _reflect(
-    world: World,
-    tubes: Tubes,
-    inside: Crossings,
-    i: Tensor,
-    bound: Tensor,
-    frequency: Tensor,
-    floor: float,
-) -> Tubes:
-    """The mirror images of rays at chosen entries."""
-    ray, which, t, normal = inside.ray[i], inside.which[i], inside.enter[i], inside.normal_enter[i]
-    d = tubes.rays.direction[ray]
-    cosine = -(d * normal).sum(-1)
-    front = cosine > 0
-    ray, which, t, normal, d, cosine, bound = (
-        x[front] for x in (ray, which, t, normal, d, cosine, bound)
-    )
-    point = tubes.rays.origin[ray] + t[:, None] * d
-    out = d + 2.0 * cosine[:, None] * normal
-    bound = bound * _reflected_at_most(world, which, point, d, out, normal, frequency)
-    width = tubes.width[ray] + tubes.spread[ray] * t
-    bend = 2.0 * _curvature(world, which, point) * width / cosine.clamp(min=STEEPEST)
-    spread = torch.clamp(tubes.spread[ray] + bend, max=WIDEST)
-    patch = world.patch(which, point)
-    step = torch.stack([which, patch], -1)[:, None]
-    keep = bound > floor
-    grown = Tubes(
-        Rays(point, out, torch.full_like(t, torch.inf)),
-        width,
-        spread,
-        bound,
-        torch.cat([tubes.history[ray], step], 1),
-        torch.cat([tubes.vertices[ray], point[:, None]], 1),
-    )
-    return _lifted(grown.take(torch.nonzero(keep).squeeze(-1)), normal[keep], world)
-
-
-def _lifted(tubes: Tubes, normal: Tensor, world: World) -> Tubes:
-    """Start reflected rays just off their surface: a rounding error must not find it again."""
-    which = tubes.history[:, -1, 0]
-    exact = world.exact[which]
-    scale = torch.maximum(world.size[which], tubes.rays.origin.abs().amax(-1))
-    lift = torch.where(exact, 1e-12 * scale, LEARNED_LIFT * torch.ones_like(scale))
-    origin = tubes.rays.origin + lift[:, None] * normal
-    tubes.rays = Rays(origin, tubes.rays.direction, tubes.rays.limit)
-    return tubes
-
-
-LEARNED_LIFT = 1e-3  # [m] above a searched float32 root and the ripple next to it
-
-
-def _reflected_at_most(
-    world: World,
-    which: Tensor,
-    point: Tensor,
-    incoming: Tensor,
-    outgoing: Tensor,
-    normal: Tensor,
-    frequency: Tensor,
-) -> Tensor:
-    """Largest |R| over frequency and polarisation."""
-    out = torch.ones(len(which), dtype=torch.float64, device=world.device)
-    i = torch.nonzero(~world.learned_surface[which]).squeeze(-1)
-    if len(i):
-        contact = Contact(point[i], incoming[i], outgoing[i], normal[i])
-        out[i] = world.reflection(which[i], contact, frequency).abs().amax(-1).amax(-1)
-    return out
-
-
-def _curvature(world: World, which: Tensor, point: Tensor) -> Tensor:
-    """Largest curvature of the surface at hits [1/m], up to the size of the tube's own worth."""
-    bend = torch.zeros(len(which), dtype=torch.float64, device=world.device)
-    flat = world.is_flat(which, point)
-    i = torch.nonzero(~flat).squeeze(-1)
-    if len(i):
-        hessian = world.jet(which[i], point[i], torch.float32).hessian
-        bend[i] = hessian.reshape(len(i), 9).norm(dim=-1)
-    return bend
-
-
 def _direct(n_tx: int, n_rx: int, depth: int, device: torch.device) -> Chains:
     tx = torch.arange(n_tx, device=device).repeat_interleave(n_rx)
     rx = torch.arange(n_rx, device=device).repeat(n_tx)
@@ -345,54 +369,5 @@ def _direct(n_tx: int, n_rx: int, depth: int, device: torch.device) -> Chains:
     return Chains(tx, rx, none, none.clone(), seed)
 
 
-def _receive(
-    tubes: Tubes,
-    t: int,
-    rx_position: Tensor,
-    depth: int,
-    quality: Quality,
-    report: SearchReport,
-) -> Chains:
-    """Chains to every receiver within a reflected tube, once per sequence, by the closest ray."""
-    sequence = _sequence(tubes.history)
-    report.sequences += int(sequence.max()) + 1 if len(sequence) else 0
-    rays, receivers, misses = [], [], []
-    block = max(1, quality.chunk * 16 // max(1, len(rx_position)))
-    for begin in range(0, len(tubes), block):
-        piece = slice(begin, begin + block)
-        miss = _miss(tubes.take(piece), rx_position)
-        i, r = torch.nonzero(miss < TUBE, as_tuple=True)
-        rays.append(i + begin)
-        receivers.append(r)
-        misses.append(miss[i, r])
-    ray, rx, miss = torch.cat(rays), torch.cat(receivers), torch.cat(misses)
-    key = sequence[ray] * len(rx_position) + rx
-    order = torch.argsort(miss, stable=True)
-    order = order[torch.argsort(key[order], stable=True)]
-    first = torch.ones(len(order), dtype=torch.bool, device=order.device)
-    first[1:] = key[order][1:] != key[order][:-1]
-    best = order[first]
-    ray, rx = ray[best], rx[best]
-    level = tubes.history.shape[1]
-    c = len(ray)
-    which = torch.full((c, depth), -1, dtype=torch.int64, device=ray.device)
-    patch = which.clone()
-    seed = torch.zeros(c, depth, 3, dtype=torch.float64, device=ray.device)
-    which[:, :level], patch[:, :level] = tubes.history[ray, :, 0], tubes.history[ray, :, 1]
-    seed[:, :level] = tubes.vertices[ray]
-    return Chains(torch.full_like(rx, t), rx, which, patch, seed)
-
-
-def _miss(tubes: Tubes, rx_position: Tensor) -> Float[Tensor, "r n"]:
-    """How far each receiver lies from each ray's axis, in half-widths of its tube there."""
-    away = rx_position[None] - tubes.rays.origin[:, None]
-    along = (away * tubes.rays.direction[:, None]).sum(-1)
-    across = torch.sqrt(torch.clamp((away * away).sum(-1) - along**2, min=0.0))
-    width = tubes.width[:, None] + tubes.spread[:, None] * along
-    return torch.where(along > 0, across / width.clamp(min=1e-300), torch.inf)
-
-
-def _sequence(history: Int[Tensor, "r d 2"]) -> Int[Tensor, "r"]:
-    """A number for each distinct sequence of (node, patch)."""
-    flat = history.reshape(history.shape[0], -1)
-    return torch.unique(flat, dim=0, return_inverse=True)[1]
+def _no_chains(depth: int, device: torch.device) -> Chains:
+    return _direct(0, 0, depth, device)

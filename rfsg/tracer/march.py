@@ -15,8 +15,8 @@ from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.kept import baked_if_it_pays
 from rfsg.scene.world import World
 from rfsg.tracer.embree import sort_by
-from rfsg.tracer.intersect import baked_roots
 from rfsg.tracer.records import Crossings, Rays, Spans
+from rfsg.tracer.roots import baked_roots
 from rfsg.tracer.seams import ASIDE, along_seams
 
 MOST_ROOTS = 16  # boundaries of one object on one ray; a chair's back has about ten
@@ -30,7 +30,7 @@ class MarchOptions:
     """step_floor: least step [m], so the thinnest thing sure to be seen. dtype: float32 to search,
     float64 to evaluate. polish: bisection-safe secant steps on a bracket. chunk: spans at a time.
     rays: how many the question launches in all; for many a learned shape is baked first (``kept``).
-    intersection: how a baked shape is met, one of ``intersect.WAYS``."""
+    intersection: how a baked shape is met, one of ``band.WAYS``."""
 
     step_floor: float = 2e-3
     dtype: torch.dtype = torch.float32

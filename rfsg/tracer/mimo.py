@@ -143,6 +143,17 @@ def _combined(
     return matrix.flatten(2, 3)
 
 
+def port_gains(
+    channel: Channel, tx: Radio, rx: Radio, paths: Int[Tensor, "m"]
+) -> Complex[Tensor, "m f n_rx n_tx"]:
+    """Each path's own matrix between the ports of two radios, delay included: ``mimo`` is their sum."""
+    between = _between(channel, tx, rx, paths)
+    sent = _steering(tx, channel.departure[paths], channel.frequency)
+    heard = _steering(rx, channel.arrival[paths], channel.frequency)
+    each = torch.einsum("pfab,pfi,pfj->pfaibj", between, heard, sent)
+    return each.flatten(4, 5).flatten(2, 3)
+
+
 def _between(
     channel: Channel, tx: Radio, rx: Radio, paths: Int[Tensor, "m"]
 ) -> Complex[Tensor, "m f a b"]:

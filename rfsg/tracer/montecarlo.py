@@ -33,19 +33,15 @@ from rfsg.scene.world import World
 from rfsg.tracer.acting import scalar
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.field import SPEED_OF_LIGHT
-from rfsg.tracer.launch import (
-    LEARNED_LIFT,
-    ended_before,
-    fibonacci,
-    search_options,
-    transmission_of,
-)
+from rfsg.tracer.lattice import fibonacci
+from rfsg.tracer.launch import ended_before, search_options, transmission_of
 from rfsg.tracer.march import crossings
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.ports import Antennas
 from rfsg.tracer.records import Crossings, Rays
 from rfsg.tracer.scatter import rough_nodes
 from rfsg.tracer.simulate import positions, resolve_frequency, world_for
+from rfsg.tracer.tubes import LEARNED_LIFT
 
 COPIES = 8  # turned copies of the lattice; eight give the standard error to about a quarter
 MEETINGS = 1_000_000  # of rays and receivers looked at at a time

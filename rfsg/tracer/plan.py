@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass, fields, replace
 
+from rfsg.objects.shapes.band import WAYS as INTERSECTIONS  # what they are: ``tracer.intersect``
 from rfsg.scene.world import World
-
-INTERSECTIONS = ("certain", "newton", "mesh", "grid")  # what they are: ``tracer.intersect``
 
 
 @dataclass(frozen=True)
@@ -30,10 +29,13 @@ class Quality:
     phase_seed: which draw of the tiles' random phases. refraction: solids bend what goes through them.
     search: "auto" enumerates all sequences of faces where the scene is small enough (nothing can be
         missed) and launches rays elsewhere; "enumerate" or "rays" insist.
-    rays: directions launched from each transmitter (Fibonacci lattice), by "rays" only. 2,000 lose
-        3 of 936 paths, 20,000 none; time grows with them.
+    rays: directions launched from each transmitter at most, or from each receiver where these are
+        fewer (Fibonacci lattice), by "rays" only. They go out in rounds, an eighth, an eighth, a quarter,
+        a half; one that finds no new chain is the last. What each found, and how much more may be
+        missing, stands in the report. 2,000 lose 3 of 936 paths, 20,000 none; time grows with them.
     floor_db: paths weaker than this below free space at the same length are not followed [dB]. -50
-        keeps two thirds of the paths of -80 and is no quicker, within 0.2 dB.
+        keeps two thirds of the paths of -80 and is no quicker, within 0.2 dB. Sequences of faces are
+        given up where the largest reflection of each, at the angles it may be met at, proves it.
     epsilon: search tolerance of a march on learned shapes [m] (the paper's 0.01 m); hits are polished.
         From 0.001 to 0.05 it moves nothing in the lab, by rays; the least is half as slow again.
     crossing_samples: nodes per stretch inside a learned object (transport integral, Eq. 23). From 4 to

@@ -23,14 +23,17 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from rfsg.objects.displayed import Displayed
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
+from rfsg.tracer import validity
 from rfsg.tracer.cells import Grid, extent, grid_on
 from rfsg.tracer.channel import power, thermal_noise_dbm
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.imagemap import power_by_images
+from rfsg.tracer.labelled import map_dataset
 from rfsg.tracer.montecarlo import COPIES, per_round
 from rfsg.tracer.patches import Patches, patches_from, patches_of
 from rfsg.tracer.plan import Quality, make_plan
@@ -44,7 +47,7 @@ METHODS = ("rays", "paths", "images")
 
 
 @dataclass(frozen=True)
-class RadioMap:
+class RadioMap(Displayed):
     """Power over cells, by transmitter in scene order; ``*c`` is [ny nx] on a plane, [c] on a surface.
 
     path_gain: linear, from the transmitter's antenna to an isotropic one, 0 where nothing arrives.
@@ -63,6 +66,21 @@ class RadioMap:
     left_out: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     scatter_db: Float[Tensor, "t *c"] | None = None
+
+    def __repr__(self) -> str:
+        cells = " x ".join(map(str, self.cells.shape))
+        return (
+            f"radio map of {len(self.path_gain)} transmitters over {cells} cells "
+            f"at {self.frequency / 1e9:g} GHz, by {self.method}"
+        )
+
+    def to_xarray(self) -> Any:
+        """An xarray.Dataset over transmitters and cells; see ``labelled.map_dataset``."""
+        return map_dataset(self)
+
+    def to_pandas(self) -> Any:
+        """A pandas.DataFrame, one row per transmitter and cell: the same quantities."""
+        return map_dataset(self).to_dataframe()
 
     def current_error_db(self) -> float:
         """Median standard error over the cells that hear something [dB]; 0 where nothing scatters."""
@@ -232,6 +250,7 @@ class _Question:
     method: str
     seed: int
     until: _Until
+    warnings: tuple[str, ...]
 
     def answer(self, cells: Grid | Patches) -> RadioMap:
         if self.method == "rays":
@@ -257,7 +276,9 @@ def _question(
     quality = Quality.named(quality) if isinstance(quality, str) else quality
     f = resolve_frequency(scene, frequency)[:1].to(device)
     world = world_for(scene, quality, device)
-    return _Question(world, f, quality, method, seed, until)
+    validity.refuse(world, f)
+    warnings = (*scene.warnings, *validity.sentences(world, f))
+    return _Question(world, f, quality, method, seed, until, warnings)
 
 
 def _corners(world: World) -> Float[Tensor, "k 3"]:
@@ -319,7 +340,7 @@ def _by_images(question: _Question, cells: Grid | Patches) -> RadioMap:
         "images",
         plan.modelled,
         (*plan.left_out, *round_edges[: quality.diffraction]),
-        scene.warnings,
+        question.warnings,
     )
 
 
@@ -356,7 +377,7 @@ def _map_of(question: _Question, cells: Grid | Patches, rounds: Rounds) -> Radio
         "rays",
         _by_rays_in_words(quality, rounds.count),
         (*make_plan(question.world, quality).left_out, _NOT_BY_RAYS),
-        (*scene.warnings, *question.until.short_of(rounds)),
+        (*question.warnings, *question.until.short_of(rounds)),
         scatter,
     )
 

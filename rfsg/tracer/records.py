@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
+from rfsg.objects.displayed import Displayed
+
 
 class Act(IntEnum):
     """What a path does at a vertex."""
@@ -129,7 +131,31 @@ class Chains:
 
 
 @dataclass(frozen=True)
-class Paths:
+class Only:
+    """Which candidates are asked for: those that visit a marked node or edge, or that begin or end at
+    a marked radio. ``edge`` numbers rows of ``Edges``.
+
+    A stage that takes one gives what it would give without it, less the candidates that meet nothing
+    marked. What it may cost is counted for all of them, so that it gives up where the whole would.
+    """
+
+    node: Bool[Tensor, "n"]
+    tx: Bool[Tensor, "t"]
+    rx: Bool[Tensor, "r"]
+    edge: Bool[Tensor, "e"]
+
+    @staticmethod
+    def pairs(
+        row: Bool[Tensor, "n"], column: Bool[Tensor, "m"]
+    ) -> list[tuple[Int[Tensor, "a"], Int[Tensor, "b"]]]:
+        """The pairs of which either is marked, as two blocks: (rows, columns) of each."""
+        every = torch.arange(len(column), device=column.device)
+        marked, rest = torch.nonzero(row).squeeze(-1), torch.nonzero(~row).squeeze(-1)
+        return [(marked, every), (rest, torch.nonzero(column).squeeze(-1))]
+
+
+@dataclass(frozen=True)
+class Paths(Displayed):
     """Exact paths. vertices holds transmitter, interactions, receiver; after the last true point the
     receiver is repeated, so every consecutive pair is a segment (of length zero in the padding).
 
@@ -149,6 +175,9 @@ class Paths:
     spread: Float[Tensor, "p"]  # [1/m], 1/length in free space
     caustics: Int[Tensor, "p"]
     status: Int[Tensor, "p"]
+
+    def __repr__(self) -> str:
+        return f"{len(self.tx)} paths of at most {self.which.shape[1]} interactions"
 
     def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "p"] | slice) -> "Paths":
         """Some of the paths."""
@@ -174,7 +203,9 @@ class Paths:
     def joined(parts: "Sequence[Paths]") -> "Paths":
         """All paths of several records, padded to the longest."""
         depth = max(p.which.shape[1] for p in parts)
-        parts = [p.padded(depth) for p in parts]
+        parts = [p.padded(depth) for p in parts if len(p.tx)] or [parts[0].padded(depth)]
+        if len(parts) == 1:
+            return parts[0]
         return Paths(
             *(torch.cat([getattr(p, n) for p in parts]) for n in Paths.__dataclass_fields__)
         )
@@ -200,14 +231,64 @@ def runs_in(which: Int[Tensor, "p d"], act: Int[Tensor, "p d"]) -> Int[Tensor, "
 
 
 @dataclass(frozen=True)
+class Failed:
+    """Candidates that came to nothing: whose they are, what they visit and how they ended, in 32 bits.
+
+    edge: the edge at each vertex (its row in ``Edges``), -1 where there is none.
+    """
+
+    tx: Int[Tensor, "c"]
+    rx: Int[Tensor, "c"]
+    which: Int[Tensor, "c d"]
+    edge: Int[Tensor, "c d"]
+    status: Int[Tensor, "c"]
+
+    @staticmethod
+    def of(paths: Paths) -> "Failed":
+        """Those of the paths that are none."""
+        some = paths.take(torch.nonzero(paths.status > int(Status.CAUSTIC_CAPPED)).squeeze(-1))
+        edge = torch.where(some.act == int(Act.DIFFRACT), some.item, -1)
+        columns = (some.tx, some.rx, some.which, edge, some.status)
+        return Failed(*(x.to(torch.int32) for x in columns))
+
+    def take(self, i: Int[Tensor, "m"] | Bool[Tensor, "c"]) -> "Failed":
+        """Some of them."""
+        return Failed(*(getattr(self, n)[i] for n in self.__dataclass_fields__))
+
+    @staticmethod
+    def joined(parts: "Sequence[Failed]") -> "Failed":
+        """All of several records, padded to the longest."""
+        depth = max(p.which.shape[1] for p in parts)
+        pad = torch.nn.functional.pad
+        wide = [
+            replace(p, **{n: pad(x, (0, depth - x.shape[1]), value=-1) for n, x in p._wide()})
+            for p in parts
+        ]
+        names = Failed.__dataclass_fields__
+        return Failed(*(torch.cat([getattr(p, n) for p in wide]) for n in names))
+
+    def _wide(self) -> list[tuple[str, Tensor]]:
+        return [("which", self.which), ("edge", self.edge)]
+
+    def counts(self) -> dict[Status, int]:
+        """How many ended in each status."""
+        numbers = torch.bincount(self.status, minlength=len(Status)).tolist()
+        return {s: numbers[s] for s in Status if numbers[s]}
+
+
+@dataclass(frozen=True)
 class Found:
     """What one mechanism adds to a simulation: paths, how many candidates ended in each status, and
-    sentences on what was modelled and what was left out."""
+    sentences on what was modelled and what was left out. ``failed``: the candidates that came to
+    nothing, and ``replaced``: those of the paths it was given that its own take the place of, where the
+    mechanism says so."""
 
     paths: tuple[Paths, ...] = ()
     counts: dict[Status, int] = field(default_factory=dict)
     modelled: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    failed: tuple[Failed, ...] = ()
+    replaced: Bool[Tensor, "p"] | None = None
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,8 @@ def bend(
     whole = Paths.joined([paths.take(~gone), *bent])
     counts = {s: int((whole.status == int(s)).sum()) for s in (Status.OK, Status.CAUSTIC_CAPPED)}
     counts[Status.REFRACTED] = int(gone.sum())
-    return Found((whole,), {s: n for s, n in counts.items() if n}, left_out=tuple(left_out))
+    counts = {s: n for s, n in counts.items() if n}
+    return Found((whole,), counts, left_out=tuple(left_out), replaced=gone)
 
 
 def _unpadded(paths: Paths, depth: int) -> Paths:

@@ -5,42 +5,47 @@ met on its network, with certainty or by one step from its zero mesh, or on stan
 that places a face wrongly by e along its normal lengthens a reflected path by at most 2 e (twice e
 times the cosine of incidence; the extra length between two parallel planes, Born and Wolf,
 Principles of Optics, section 7.6.1), and its phase by 4 pi e / lambda. The path's phasor moves by no
-more, |exp(j x) - 1| <= x, so that the gain of a link that this object alone reflects onto, however
-its paths sum up, changes by at most
+more, |exp(j x) - 1| <= x, and that of a path that is lost by its own length. So where a way may lack a
+share p of the surface, the gain of a link that this object alone reflects onto, however its paths sum
+up, changes by at most
 
-    20 log10(1 + 4 pi e / lambda) dB
+    20 log10(1 + 4 pi e / lambda + p) dB
 
-of the sum of their amplitudes. What the shape itself is wrong by, its training, no way mends.
+of the sum of their amplitudes. e and p are those measured of this very shape when it was baked
+(``offs``): e of 99 % of the surface, p an upper bound. Of a shape that is not baked nothing is known, so
+nothing stands in for it. What the shape itself is wrong by, its training, no way mends.
 """
 
 import math
 
+from rfsg.objects.shapes.kept import offs_of
 from rfsg.scene.scene import Node
 
-# Position error at 99 % of hits against the network's own surface, largest of the shapes measured
-# by benchmarks/intersect.py [m]; cheapest way first. "certain" is the way that nothing is lost on.
-POSITION_ERROR = {"mesh": 1e-3, "grid": 1e-3, "newton": 2e-5, "certain": 1e-7}
+# Cheapest first, as docs/intersection.md measures them. "grid" is not among them: it costs more than
+# "certain" there.
+WAYS = ("mesh", "newton", "certain")
 CERTAIN = "certain"
 MOST_TOLD = 20  # objects in a report
 
 
-def phase_error_db(position_error: float, wavelength: float) -> float:
-    """Most that a face wrong by so much [m] changes a reflected wave of this wavelength [m], in dB of
-    amplitude: 20 log10(1 + 4 pi e / lambda). Raises ValueError for numbers that are not positive."""
-    if not (position_error >= 0.0 and 0.0 < wavelength < math.inf):
+def error_db(position_error: float, wavelength: float, lost: float = 0.0) -> float:
+    """Most that a face wrong by so much [m], a share of which is lost, changes a reflected wave of this
+    wavelength [m], in dB of amplitude: 20 log10(1 + 4 pi e / lambda + p). Raises ValueError for lengths
+    that are not positive, or a share that is none."""
+    if not (position_error >= 0.0 and 0.0 < wavelength < math.inf and 0.0 <= lost <= 1.0):
         raise ValueError(
-            f"position error {position_error!r} m, wavelength {wavelength!r} m: expected at least 0 "
-            "and above 0"
+            f"position error {position_error!r} m, wavelength {wavelength!r} m, lost {lost!r}: "
+            "expected at least 0, above 0, and 0 to 1"
         )
-    return 20.0 * math.log10(1.0 + 4.0 * math.pi * position_error / wavelength)
+    return 20.0 * math.log10(1.0 + 4.0 * math.pi * position_error / wavelength + lost)
 
 
 def choose(node: Node, wavelength: float, accuracy_db: float) -> tuple[str, str]:
     """The cheapest way to meet an object that keeps within an accuracy [dB], and why, in a sentence.
 
-    wavelength: [m]. The way is "analytic" or "faces" for shapes known exactly, else a key of
-    ``POSITION_ERROR``; "certain" where no cheaper one is accurate enough. Raises ValueError for a
-    wavelength or an accuracy that is not positive.
+    wavelength: [m]. The way is "analytic" or "faces" for shapes known exactly, else one of ``WAYS``;
+    "certain" where no cheaper one is known to be accurate enough. Raises ValueError for a wavelength
+    or an accuracy that is not positive.
     """
     if not 0.0 < accuracy_db < math.inf:
         raise ValueError(f"accuracy_db={accuracy_db!r}: expected a positive finite number")
@@ -49,12 +54,20 @@ def choose(node: Node, wavelength: float, accuracy_db: float) -> tuple[str, str]
         way = "faces" if shape.kind == "mesh" else "analytic"
         closed = "flat faces" if shape.faceted else "a closed form"
         return way, f"{node.path}: {closed} ({shape.kind}), exact"
+    offs = offs_of(shape)
+    if offs is None:
+        return CERTAIN, (
+            f"{node.path}: learned, met by {CERTAIN!r}: not baked, so that nothing is known of "
+            "what stands in for its network"
+        )
     scale = float(node.pose.scale.detach())
-    most = {way: phase_error_db(scale * e, wavelength) for way, e in POSITION_ERROR.items()}
-    way = next((way for way in most if most[way] <= accuracy_db), CERTAIN)
+    most = {way: error_db(scale * offs[way].usual, wavelength, offs[way].lost) for way in WAYS}
+    way = next((way for way in WAYS if most[way] <= accuracy_db), CERTAIN)
+    off = offs[way]
     return way, (
-        f"{node.path}: learned, met by {way!r}: {1e3 * scale * POSITION_ERROR[way]:.2g} mm at 99 % "
-        f"of hits are at most {most[way]:.2g} dB at a wavelength of {1e3 * wavelength:.3g} mm"
+        f"{node.path}: learned, met by {way!r}: off by {1e3 * scale * off.usual:.2g} mm on 99 % of it, "
+        f"at most {1e3 * scale * off.most:.2g} mm, and no more than {100 * off.lost:.2g} % lost, is "
+        f"at most {most[way]:.2g} dB at a wavelength of {1e3 * wavelength:.3g} mm"
     )
 
 
@@ -68,7 +81,6 @@ def told(nodes: tuple[Node, ...], wavelength: float, accuracy_db: float) -> tupl
 
 def strictest(nodes: tuple[Node, ...], wavelength: float, accuracy_db: float) -> str:
     """The one way that is accurate enough for every object, where all are met alike."""
-    ways = list(POSITION_ERROR)
     needed = [choose(node, wavelength, accuracy_db)[0] for node in nodes]
-    ranks = [ways.index(way) for way in needed if way in POSITION_ERROR]
-    return ways[max(ranks)] if ranks else CERTAIN
+    ranks = [WAYS.index(way) for way in needed if way in WAYS]
+    return WAYS[max(ranks)] if ranks else CERTAIN

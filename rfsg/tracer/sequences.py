@@ -17,32 +17,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.scene.world import World
+from rfsg.tracer.bounds import Floor
 from rfsg.tracer.faces import Planes, Samples, looks_at, planes_of, samples_of
 from rfsg.tracer.glances import astray
 from rfsg.tracer.glints import NEAR, glints
 from rfsg.tracer.plan import Quality
+from rfsg.tracer.prefixes import Budget, Prefixes, levels, mirror
 from rfsg.tracer.reached import reached
-from rfsg.tracer.records import Chains
+from rfsg.tracer.records import Chains, Only
 
 MOST_PAIRS = 300_000_000  # beam tests and image solves an enumeration may take: a minute or two
 PORTION = 1 << 16  # pairs of images at a time
 BLOCK = 1 << 20  # (node, prefix) tests at a time: bounds memory
-EDGE = 1e-9  # of a face's extent: a path through a face's very edge belongs to it
-
-
-class TooMany(Exception):
-    """The scene has more sequences than an enumeration should take; search by rays instead."""
-
-
-@dataclass(frozen=True)
-class Prefixes:
-    """Sequences of planar faces seen from one source: the image it makes and the faces, in order."""
-
-    image: Float[Tensor, "p 3"]
-    faces: Int[Tensor, "p d"]
-
-    def take(self, i: Tensor) -> "Prefixes":
-        return Prefixes(self.image[i], self.faces[i])
 
 
 @torch.no_grad()
@@ -52,10 +38,14 @@ def enumerate_chains(
     rx_position: Float[Tensor, "r 3"],
     wavelength: float,
     quality: Quality,
+    only: Only | None = None,
+    floor: Floor | None = None,
 ) -> Chains:
     """All candidate chains with at most one curved or learned face, direct ones left out.
 
-    wavelength: [m] what learned faces are measured at. Raises TooMany when the scene is too large for it.
+    wavelength: [m] what learned faces are measured at. only: which of them, if not all. floor: planar
+    chains that are proven to lie below it are left out; it counts them. A curved face may focus, so
+    no chain with one is. Raises TooMany when the scene is too large for it.
     """
     planes, samples = planes_of(world), samples_of(world)
     if not quality.curved:
@@ -64,95 +54,19 @@ def enumerate_chains(
     parts, fore = [], []
     inner = min(quality.depth, quality.curved_depth) - 1 if samples else 0
     for t in range(len(tx_position)):
-        ahead = levels(planes, tx_position[t], quality.depth, budget)
+        ahead = levels(planes, tx_position[t], quality.depth, budget, floor, inner)
         for level in ahead[1:]:
-            parts.append(_planar_chains(planes, level, t, rx_position, quality, budget))
+            strong = level.above(floor)
+            if floor is not None:
+                floor.pruned += len(level.image) - len(strong.image)
+            parts.append(_planar_chains(planes, strong, t, rx_position, quality, budget, only))
         fore.append(ahead[: inner + 1])
     if samples:
         behind = [levels(planes, source, inner, budget) for source in rx_position]
         ends = _by_level(fore), _by_level(behind)
         for item in samples:
-            parts += _glint_chains(world, planes, item, ends, wavelength, quality, budget)
+            parts += _glint_chains(world, planes, item, ends, wavelength, quality, budget, only)
     return _join(parts, quality.depth, world.device)
-
-
-class Budget:
-    """Counts work and raises TooMany when it runs out."""
-
-    def __init__(self, most: int):
-        self.left = most
-
-    def spend(self, amount: int) -> None:
-        self.left -= amount
-        if self.left < 0:
-            raise TooMany
-
-
-def levels(planes: Planes, source: Tensor, depth: int, budget: Budget) -> list[Prefixes]:
-    """Prefixes of 0, 1, ... depth faces from a source."""
-    none = torch.zeros(1, 0, dtype=torch.int64, device=source.device)
-    levels = [Prefixes(source[None], none)]
-    for _ in range(depth):
-        levels.append(_extend(planes, levels[-1], budget))
-    return levels
-
-
-def _extend(planes: Planes, prefixes: Prefixes, budget: Budget) -> Prefixes:
-    p, k = len(prefixes.image), len(planes)
-    budget.spend(p * k)
-    image = [prefixes.image[:0]]
-    face = [
-        torch.zeros(0, prefixes.faces.shape[1] + 1, dtype=torch.int64, device=planes.node.device)
-    ]
-    block = max(1, 2_000_000 // max(k, 1))
-    for begin in range(0, p, block):
-        some = prefixes.take(torch.arange(begin, min(p, begin + block), device=planes.node.device))
-        front = some.image @ planes.normal.T - planes.offset > 0
-        if prefixes.faces.shape[1]:
-            front &= _visible(planes, some)
-        row, column = torch.nonzero(front, as_tuple=True)
-        if prefixes.faces.shape[1]:
-            kept = _in_beam(planes, some, row, column)
-            row, column = row[kept], column[kept]
-        image.append(_mirror(planes, some.image[row], column))
-        face.append(torch.cat([some.faces[row], column[:, None]], 1))
-    return Prefixes(torch.cat(image), torch.cat(face))
-
-
-def _mirror(planes: Planes, point: Tensor, face: Tensor) -> Tensor:
-    height = (point * planes.normal[face]).sum(-1) - planes.offset[face]
-    return point - 2.0 * height[:, None] * planes.normal[face]
-
-
-def _visible(planes: Planes, prefixes: Prefixes) -> Bool[Tensor, "p k"]:
-    """Faces with some corner on the outgoing side of the prefix's last face, and not that face."""
-    last, row = torch.unique(prefixes.faces[:, -1], return_inverse=True)
-    # only of the last faces at hand: of all faces at once it would be a table of gigabytes
-    height = planes.normal[last] @ planes.corners().reshape(-1, 3).T
-    highest = height.reshape(len(last), len(planes), 4).amax(-1)
-    beyond = highest - planes.offset[last, None] > 0
-    beyond[torch.arange(len(last), device=last.device), last] = False
-    return beyond[row]
-
-
-def _in_beam(planes: Planes, prefixes: Prefixes, row: Tensor, face: Tensor) -> Bool[Tensor, "m"]:
-    """Does the shadow of a face, cast from the image onto the last face, meet that face's rectangle?
-
-    Corners behind the last face are pulled to just in front of it: the shadow then only grows.
-    """
-    last = prefixes.faces[row, -1]
-    image, corner = prefixes.image[row], planes.corners()[face]
-    normal, offset = planes.normal[last], planes.offset[last]
-    near = (image * normal).sum(-1) - offset  # negative: images lie behind their mirror
-    height = (corner * normal[:, None]).sum(-1) - offset[:, None]
-    behind = height <= 0
-    t = -near[:, None] / (height - near[:, None]).clamp(min=1e-12)
-    shadow = image[:, None] + t[..., None] * (corner - image[:, None])
-    local = shadow - planes.centre[last][:, None]
-    uv = torch.einsum("mcj,mij->mci", local, planes.edges[last])
-    half = planes.half[last] * (1 + EDGE)
-    apart = (uv.amin(1) > half) | (uv.amax(1) < -half)
-    return behind.any(1) | ~apart.any(1)
 
 
 def _planar_chains(
@@ -162,13 +76,26 @@ def _planar_chains(
     rx_position: Tensor,
     quality: Quality,
     budget: Budget,
+    only: Only | None,
 ) -> Chains:
     """Prefixes that mirror the transmitter onto a receiver, through the rectangles of all faces."""
     budget.spend(len(prefixes.image) * len(rx_position))
-    row, rx = reached(planes, prefixes.image, prefixes.faces, rx_position)
-    face = prefixes.faces[row]
-    seed = torch.zeros(*face.shape, 3, dtype=torch.float64, device=face.device)
-    return _chains(planes, t, rx, face, seed, quality.depth)
+    wanted = [tuple(torch.arange(len(x), device=x.device) for x in (prefixes.image, rx_position))]
+    if only is not None:
+        wanted = Only.pairs(only.tx[t] | _marked(planes, prefixes.faces, only), only.rx)
+    parts = []
+    for some, receivers in wanted:
+        mine = prefixes.take(some)
+        row, rx = reached(planes, mine.image, mine.faces, rx_position[receivers])
+        face = mine.faces[row]
+        seed = torch.zeros(*face.shape, 3, dtype=torch.float64, device=face.device)
+        parts.append(_chains(planes, t, receivers[rx], face, seed, quality.depth))
+    return Chains.joined(parts)
+
+
+def _marked(planes: Planes, faces: Int[Tensor, "p d"], only: Only) -> Bool[Tensor, "p"]:
+    """Sequences that hold a face of a marked node."""
+    return only.node[planes.node[faces]].any(1)
 
 
 @dataclass(frozen=True)
@@ -241,6 +168,7 @@ def _glint_chains(
     wavelength: float,
     quality: Quality,
     budget: Budget,
+    only: Only | None,
 ) -> list[Chains]:
     """(planar..., an object of this shape, planar...) between all transmitters and receivers."""
     ahead, behind = (
@@ -251,7 +179,13 @@ def _glint_chains(
         for j, after in enumerate(links[1]):
             if i + j + 1 > min(quality.depth, quality.curved_depth):
                 continue
-            for node, a, b in _paired(len(world), ahead[i], behind[j], item, budget):
+            marked = None
+            if only is not None:
+                marked = (
+                    only.node[ahead[i][0]] | _begins(planes, before, only, only.tx)[ahead[i][1]],
+                    _begins(planes, after, only, only.rx)[behind[j][1]],
+                )
+            for node, a, b in _paired(len(world), ahead[i], behind[j], item, budget, marked):
                 images = (
                     world.point_object(node, before.prefixes.image[a]),
                     world.point_object(node, after.prefixes.image[b]),
@@ -264,6 +198,11 @@ def _glint_chains(
                 ends = before.take(a[pair]), after.take(b[pair])
                 parts.append(_glint_part(world, planes, item, node[pair], sample, ends, quality))
     return parts
+
+
+def _begins(planes: Planes, ends: Ends, only: Only, radio: Bool[Tensor, "r"]) -> Bool[Tensor, "p"]:
+    """Prefixes that meet something marked, their own radio included."""
+    return radio[ends.owner] | _marked(planes, ends.prefixes.faces, only)
 
 
 def _promising(
@@ -290,14 +229,33 @@ def _paired(
     behind: tuple[Tensor, Tensor],
     item: Samples,
     budget: Budget,
+    marked: tuple[Bool[Tensor, "a"], Bool[Tensor, "b"]] | None,
 ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-    """Every (node, prefix before it, prefix after it), in portions; both lists lie in order of nodes."""
+    """Every (node, prefix before it, prefix after it), in portions; both lists lie in order of nodes.
+
+    marked: of either list; then those of which either is.
+    """
+    many = [torch.bincount(node, minlength=nodes) for node, _ in (ahead, behind)]
+    # samples of clusters that stay are a few times more
+    budget.spend(int((many[0] * many[1]).sum()) * len(item.clusters))
+    blocks = [(ahead, behind)]
+    if marked is not None:
+        blocks = [
+            ((ahead[0][i], ahead[1][i]), (behind[0][j], behind[1][j]))
+            for i, j in Only.pairs(*marked)
+        ]
+    for fore, aft in blocks:
+        yield from _portions(nodes, fore, aft)
+
+
+def _portions(
+    nodes: int, ahead: tuple[Tensor, Tensor], behind: tuple[Tensor, Tensor]
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
     many = [torch.bincount(node, minlength=nodes) for node, _ in (ahead, behind)]
     count = many[0] * many[1]
     last = torch.cumsum(count, 0)
     start = [torch.cumsum(m, 0) - m for m in many]
     total = int(last[-1]) if nodes else 0
-    budget.spend(total * len(item.clusters))  # samples of clusters that stay are a few times more
     for begin in range(0, total, PORTION):
         number = torch.arange(begin, min(total, begin + PORTION), device=count.device)
         node = torch.searchsorted(last, number, right=True)
@@ -351,7 +309,7 @@ def _unfold(
         uv = torch.einsum("cj,cij->ci", target - planes.centre[face], planes.edges[face]).abs()
         on &= (near < 0) & (far > -slack) & (uv <= planes.half[face] + slack[:, None]).all(-1)
         points.insert(0, target)
-        image = _mirror(planes, image, face)
+        image = mirror(planes, image, face)
     if not points:
         return image.new_zeros(len(image), 0, 3), on
     return torch.stack(points, 1), on

@@ -1,15 +1,15 @@
 """Paths over learned surfaces come to rest: measure the zone, solve on the facet, measure again.
 
 The first look costs no network at all: the facets of an object's samples were measured once. Most
-candidates end there. Rounds then run in float32 until a vertex hardly moves, and in float64 until it
-stands still, so that the answer depends on where the path rests and not on where the search began:
-reciprocity is as exact as float64.
+candidates end there. Rounds then run on sketches of the networks until a vertex hardly moves, and on the
+networks themselves, in float64, until it stands still, so that the answer depends on where the path
+rests and not on where the search began: reciprocity is as exact as float64.
 """
 
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from rfsg.scene.world import World, unit
@@ -17,6 +17,7 @@ from rfsg.tracer import zone
 from rfsg.tracer.faces import nearest_facets
 from rfsg.tracer.feet import Feet
 from rfsg.tracer.implicit import segments
+from rfsg.tracer.mixing import History
 from rfsg.tracer.newton import ROUNDING, Batch, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Status
@@ -32,6 +33,7 @@ RESTLESS, SHRINKING = (
     0.05,
     0.7,
 )  # of its zone's radius: else it cycles between two views of a rough face
+LATE = 6  # rounds after which whatever still moves is near its end
 STILL = 1e-4  # [m] a vertex that moves less stays on the face that it has, or on none
 RETURN = 5.0  # times its last move: a vertex comes back no further than this
 SAME = 1e-3  # [m] chains of one sequence this close after two rounds are on their way to one path
@@ -57,8 +59,7 @@ class State:
     status: Tensor
     charts: Charts
     curvature: Float[Tensor, "c d"]
-    before: Float[Tensor, "c d 3"]  # the change of the round before, and where it led
-    moved: Float[Tensor, "c d 3"]
+    history: History
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,11 @@ def settle(
     rows = torch.arange(len(batch.x), device=world.device)
     settling = Settling(world, wavelength, quality)
     rows, _ = _round(settling, batch, state, rows, look=True)
-    rows = _rounds(settling, batch, state, rows, torch.float32)
+    rough = replace(settling, world=world.sketched(zone.SKETCHED * wavelength))
+    rows = _rounds(rough, batch, state, rows, torch.float32)
+    twin = _twins(batch.take(rows), state.x[rows])
+    state.status[rows[twin]] = int(Status.DUPLICATE)
+    rows = rows[~twin]
     precise = replace(settling, quality=replace(quality, refits=PRECISE * quality.refits))
     _rounds(precise, batch, state, rows, torch.float64)
     return state.x, state.status, state.charts
@@ -123,15 +128,15 @@ def _start(world: World, batch: Batch) -> State:
     flat = torch.zeros(c, depth, dtype=torch.float64, device=world.device)
     status = torch.full((c,), int(Status.NOT_CONVERGED), device=world.device)
     charts = Charts(batch.x.clone(), normal, flat)
-    return State(
-        batch.x.clone(), status, charts, flat.clone(), torch.zeros_like(batch.x), batch.x.clone()
-    )
+    history = History.none(c, 7 * depth, batch.x)
+    return State(batch.x.clone(), status, charts, flat.clone(), history)
 
 
 def _rounds(
     settling: Settling, batch: Batch, state: State, rows: Tensor, dtype: torch.dtype
 ) -> Tensor:
-    """Rounds in one precision; returns the rows that came to rest in it."""
+    """Rounds in one precision; returns the rows that came to rest in it, and in float32 those that are
+    not given up as well."""
     done, feet = [rows[:0]], None
     for number in range(settling.quality.refits):
         going, feet = _round(settling, batch, state, rows, dtype=dtype, number=number, feet=feet)
@@ -140,6 +145,8 @@ def _rounds(
         rows = going
         if not len(rows):
             break
+    if dtype != torch.float64:
+        done.append(rows)
     ready = torch.cat(done)
     if dtype != torch.float64:
         state.status[ready] = int(Status.NOT_CONVERGED)  # until float64 has confirmed them
@@ -171,8 +178,8 @@ def _round(
         facets, feet = zones.measured(dtype, feet)
         state.charts.centre[rows], state.charts.radius[rows] = part.x, radius
     seen = settling.solve(part, facets)
-    moved, change = seen.moved, seen.moved - part.x
-    step = change.norm(dim=-1).amax(-1)
+    moved = seen.moved
+    step = (moved - part.x).norm(dim=-1).amax(-1)
     least = SETTLED + ROUNDING * moved.abs().amax((1, 2)) if precise else NEARLY
     at_rest = (not look) & seen.settled & (step < least)
     lost = _lost(settling, part, seen, facets, learned, precise, look or number == 0)
@@ -187,13 +194,8 @@ def _round(
         twin = _twins(part, moved) & go
         state.status[rows[twin]] = int(Status.DUPLICATE)
         go = go & ~twin
-    leap = (go & (number > 1))[:, None, None]
-    mixed = _mixed(moved, change, state.moved[rows], state.before[rows])
-    state.x[rows] = torch.where(leap, mixed, moved)
-    state.before[rows], state.moved[rows] = change, moved
-    state.curvature[rows] = seen.curvature
-    # the charts on which a row came to rest stay; those of a row that goes on turn with its surface
-    state.charts.normal[rows[go]] = seen.normal[go]
+    state.x[rows] = moved
+    _advance(state, rows, part, seen, radius, number, go, all_of_it=precise or number >= LATE)
     if feet is not None:
         feet = feet.take(torch.nonzero(go[torch.nonzero(learned)[:, 0]]).squeeze(-1))
     return rows[go], feet
@@ -212,16 +214,41 @@ def _twins(part: Batch, moved: Tensor) -> Tensor:
     return twin
 
 
-def _mixed(moved: Tensor, change: Tensor, moved_before: Tensor, before: Tensor) -> Tensor:
-    """Anderson's step of depth one: the mix of the last two rounds whose changes cancel best.
+def _advance(
+    state: State,
+    rows: Tensor,
+    part: Batch,
+    seen: Seen,
+    radius: Float[Tensor, "c d"],
+    number: int,
+    go: Tensor,
+    all_of_it: bool,
+) -> None:
+    """Where the rows that ``go`` on begin their next round: at a mix of the last rounds' answers.
 
-    Rounds shrink, or swing to and fro, by a steady factor; the mix goes to where they would end.
+    all_of_it: places, normals and bends, of several rounds; else places alone, of two, for from afar
+    rounds are anything but linear. The charts of rows at rest stay those that they rest on.
     """
-    now, turn = change.flatten(1), (change - before).flatten(1)
-    square = (turn * turn).sum(1)
-    share = (now * turn).sum(1) / torch.where(square == 0, torch.ones_like(square), square)
-    share = torch.where(square == 0, torch.zeros_like(share), share.clamp(-5.0, 0.95))
-    return moved - share[:, None, None] * (moved - moved_before)
+    c, depth = radius.shape
+    led = _row(seen.moved, seen.normal, seen.curvature)
+    change = led - _row(part.x, state.charts.normal[rows], state.curvature[rows])
+    share = 1.0 if all_of_it else 0.0
+    weight = (share * radius)[..., None].expand_as(part.x)
+    scale = _row(torch.ones_like(part.x), weight, weight[..., 0] * radius)
+    rounds = 0 if number < 2 else number if all_of_it else 1
+    mixed = state.history.mixed(rows, led, change, scale, rounds)
+    x, normal, bend = mixed[go].split([3 * depth, 3 * depth, depth], 1)
+    some = rows[go]
+    state.x[some] = x.reshape(-1, depth, 3)
+    state.charts.normal[some] = unit(normal.reshape(-1, depth, 3)) if all_of_it else seen.normal[go]
+    state.curvature[rows] = seen.curvature
+    if all_of_it:
+        state.curvature[some] = bend.clamp(min=0.0)
+
+
+def _row(x: Tensor, normal: Tensor, bend: Tensor) -> Float[Tensor, "c n"]:
+    """Places, normals and bends of all vertices of each chain, side by side."""
+    return torch.cat([x.flatten(1), normal.flatten(1), bend], 1)
 
 
 def _lost(
@@ -247,7 +274,9 @@ def _lost(
         hopeless[~seen.settled] = int(Status.NOT_CONVERGED)
     which = batch.which.reshape(-1)
     f, gradient = world.value_and_gradient(which, moved.reshape(-1, 3), torch.float32)
-    f, gradient = f.abs().reshape(c, depth), gradient.reshape(c, depth, 3)
+    # beyond its bounds a network may say anything; the surface is at least as far as they are
+    f = torch.maximum(f.abs(), _beyond(world, which, moved.reshape(-1, 3)))
+    f, gradient = f.reshape(c, depth), gradient.reshape(c, depth, 3)
     # a stationary point off the object by a tenth of its size is another object's business
     allowed = 2.0 * tolerance(world, batch, wavelength)
     far = torch.where(
@@ -262,6 +291,16 @@ def _lost(
         off |= learned & ((gradient * seen.normal).sum(-1) < 0)  # another face, seen from behind
     hopeless[off.any(1) | ~torch.isfinite(moved).all(-1).all(-1)] = int(Status.OFF_SURFACE)
     return hopeless
+
+
+def _beyond(
+    world: World, which: Int[Tensor, "m"], point: Float[Tensor, "m 3"]
+) -> Float[Tensor, "m"]:
+    """How far points lie outside the bounds of their objects [m]."""
+    low, high = world.bounds_object.detach()[which].unbind(1)
+    local = world.point_object(which, point)
+    out = torch.maximum(low - local, local - high).clamp(min=0.0)
+    return out.norm(dim=-1) * world.scale.detach()[which]
 
 
 MARGIN = 1.1  # by which a face may fail in float32 and be a mirror in float64

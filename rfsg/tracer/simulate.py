@@ -2,25 +2,27 @@
 
 import math
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from rfsg.objects.displayed import Displayed
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.world import World
-from rfsg.tracer import diffraction, refract, scatter, validity
-from rfsg.tracer import field as fields
+from rfsg.tracer import incremental, scatter, validity
 from rfsg.tracer.channel import Link, links, transfer
-from rfsg.tracer.edges import edges_in
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.field import SPEED_OF_LIGHT
-from rfsg.tracer.launch import SearchReport, search
+from rfsg.tracer.incremental import Redone
+from rfsg.tracer.kept import Kept
+from rfsg.tracer.labelled import channel_dataset, links_frame, paths_frame
+from rfsg.tracer.launch import SearchReport
 from rfsg.tracer.memory import peak_bytes
 from rfsg.tracer.plan import Plan, Quality, make_plan
 from rfsg.tracer.records import Chains, Channel, Paths, Status
@@ -31,16 +33,17 @@ from rfsg.tracer.response import (
     impulse_response,
     taps,
 )
-from rfsg.tracer.solve import solve
+from rfsg.tracer.stages import Candidates, Run, candidates
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Result:
+class Result(Displayed):
     """Everything about one simulation. ``paths`` and ``channel`` share their path axis.
 
-    peak_bytes: the most memory in use when it ended (``memory.peak_bytes``).
+    peak_bytes: the most memory in use when it ended (``memory.peak_bytes``). redone: how much of it was
+    new, where it went on from an earlier one; kept: what the next may go on from (``after``).
     """
 
     scene: Scene
@@ -54,6 +57,15 @@ class Result:
     seconds: dict[str, float]
     warnings: tuple[str, ...] = field(default=())
     peak_bytes: int | None = None
+    redone: Redone | None = None
+    kept: Kept | None = field(default=None, repr=False, compare=False)
+
+    def after(self, scene: Scene, progress: Progress | None = None) -> "Result":
+        """The same question about an edited scene: only what the edit changes is done again.
+
+        result.after(result.scene.moved("/World/Cabinet", (1.0, 0.0, 0.0)))
+        """
+        return simulate(scene, previous=self, progress=progress)
 
     def transfer(self) -> Complex[Tensor, "t r f"]:
         """h(f) of every transmitter and receiver, antennas included, 1 W in."""
@@ -85,12 +97,30 @@ class Result:
         """One record per transmitter and receiver, at the first frequency."""
         return links(self.scene, self.paths, self.channel)
 
+    def to_xarray(self) -> Any:
+        """The channel as an xarray.Dataset; see ``labelled.channel_dataset``."""
+        return channel_dataset(self)
+
+    def to_pandas(self, what: str = "paths") -> Any:
+        """A pandas.DataFrame: "paths", a row each as in paths.csv, or "links", as in links.csv.
+
+        Raises ValueError for another word."""
+        frames = {"paths": paths_frame, "links": links_frame}
+        if what not in frames:
+            raise ValueError(f"{what!r}: expected one of {', '.join(frames)}")
+        return frames[what](self)
+
+    def __repr__(self) -> str:
+        hertz = ", ".join(f"{f / 1e9:g}" for f in self.frequency.tolist())
+        return f"{len(self.paths.tx)} paths in a {self.scene!r} at {hertz} GHz"
+
 
 def simulate(
     scene: Scene,
     frequency: float | Tensor | None = None,
-    quality: str | Quality = "standard",
+    quality: str | Quality | None = None,
     *,
+    previous: Result | None = None,
     accuracy_db: float | None = None,
     budget_s: float | None = None,
     gradients: bool = False,
@@ -100,13 +130,29 @@ def simulate(
 ) -> Result:
     """Exact paths and the channel between all transmitters and receivers of a scene.
 
-    frequency: [Hz], one or several [f]; None takes the transmitters' or the scene's own.
+    frequency: [Hz], one or several [f]; None takes those of ``previous``, else the transmitters' or the
+    scene's own. quality: None takes that of ``previous``, else "standard". previous: an earlier result:
+    what is as it was then is kept, and the answer is a full run's, to 1e-9 of each gain
+    (``incremental``; ``result.redone`` and the plan say how much was done again).
     accuracy_db, budget_s: choose the setting by pilot runs, in place of ``quality``: the cheapest that
     is accurate enough, the most accurate within the time (``dial.within``). gradients: keep the graph,
     so that ``result.channel`` differentiates with respect to poses, radio positions, shapes, materials
     and weights that require it. chains: candidates kept from an earlier result (the search is skipped).
-    Raises SceneError without a frequency or with broken radios.
+    Raises SceneError without a frequency or with broken radios, ValueError for ``previous`` beside what
+    it cannot serve.
     """
+    if previous is not None:
+        asked = {"accuracy_db": accuracy_db is not None, "budget_s": budget_s is not None}
+        asked |= {"gradients": gradients, "chains": chains is not None}
+        wrong = [name for name, given in asked.items() if given]
+        if wrong:
+            raise ValueError(
+                f"previous= beside {wrong[0]}=: what is kept of an earlier simulation holds no "
+                f"gradients and is of one quality; leave one of the two out"
+            )
+        frequency = previous.frequency if frequency is None else frequency
+        quality = previous.plan.quality if quality is None else quality
+    quality = "standard" if quality is None else quality
     if accuracy_db is not None or budget_s is not None:
         from rfsg.tracer.dial import simulate_within  # which simulates, too
 
@@ -132,39 +178,32 @@ def simulate(
             plan = make_plan(world, quality)
         with _timed(seconds, "proxies", tell):
             proxies = Proxies(world)
+        run = Run(world, proxies, tx, rx, frequencies, quality)
         with _timed(seconds, "search", tell):
-            report = SearchReport()
+            before, why = incremental.since(previous.kept, run) if previous else (None, None)
             if chains is None:
-                chains, report = search(world, proxies, tx, rx, frequencies, quality)
-                plan = plan.with_((report.sentence(),))
+                found = candidates(run, before)
+                plan = plan.with_((found.report.sentence(),))
+            else:
+                found = Candidates(chains, run.none(), SearchReport(), searched=False)
         with _timed(seconds, "solve", tell):
-            wavelength = SPEED_OF_LIGHT / float(frequencies[0])
-            paths, counts = solve(world, chains, tx, rx, wavelength, quality)
-            edges, more = None, []
-            if quality.refraction and bool(world.solid.any()):
-                bent = refract.bend(world, proxies, paths, frequencies, quality)
-                (paths,), more = bent.paths, [replace(bent, paths=())]
-            if quality.diffraction:
-                edges = edges_in(world, wavelength)
-                more.append(diffraction.paths_of(world, edges, tx, rx, wavelength, quality))
-            if bool(scatter.rough_nodes(world).any()):
-                more.append(scatter.paths_of(world, tx, rx, quality))
-            paths = Paths.joined([paths, *(p for found in more for p in found.paths)])
-            for found in more:
-                counts = Counter(counts) + Counter(found.counts)
-                plan = plan.with_(found.modelled, found.left_out)
+            done = incremental.solved(run, found, before)
+            for stage in done.stages:
+                plan = plan.with_(stage.modelled, stage.left_out)
         with _timed(seconds, "field", tell):
-            channel = fields.channel(
-                world,
-                proxies,
-                paths,
-                scene.transmitters,
-                scene.receivers,
-                frequencies,
-                quality,
-                edges,
+            everything = incremental.fielded(run, done.stages, done.around.edges, before)
+            paths, channel, counts = _above_floor(
+                everything.paths, everything.channel, done.counts, quality
             )
-            paths, channel, counts = _above_floor(paths, channel, counts, quality)
+    redone = None
+    if previous is not None:
+        redone = Redone.of(done, everything)
+        said = (
+            redone.sentence() if why is None else f"a full run, nothing of the earlier kept: {why}"
+        )
+        plan = plan.with_((said,))
+    keeps = not gradients and chains is None
+    kept = incremental.keep(run, done, everything) if keeps else None
     named = {s.name: n for s, n in sorted(counts.items())}
     warnings = (*scene.warnings, *validity.sentences(world, frequencies))
     return Result(
@@ -172,13 +211,15 @@ def simulate(
         frequencies,
         paths,
         channel,
-        chains,
+        done.mirrors.chains,
         plan,
-        report,
+        found.report,
         named,
         seconds,
         warnings,
         peak_bytes(device),
+        redone,
+        kept,
     )
 
 

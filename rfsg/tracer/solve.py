@@ -68,6 +68,35 @@ def solve(
     Gradients flow to poses, shapes and positions when grad mode is on. Rejected candidates are
     dropped unless ``keep_failed``.
     """
+    parts = _parts(world, chains, (tx_position, rx_position), wavelength, quality)
+    paths, status = _gather(world, chains, parts, keep_failed, twins=False)
+    numbers = torch.bincount(status, minlength=len(Status)).tolist()
+    return paths, {s: numbers[s] for s in Status if numbers[s]}
+
+
+def solve_each(
+    world: World,
+    chains: Chains,
+    tx_position: Float[Tensor, "t 3"],
+    rx_position: Float[Tensor, "r 3"],
+    wavelength: float,
+    quality: Quality,
+) -> tuple[Paths, Int[Tensor, "c"]]:
+    """Exact paths of candidate chains, in their order, and how each candidate ended. Paths over faces
+    that coincide (``seams``) are left to the caller."""
+    parts = _parts(world, chains, (tx_position, rx_position), wavelength, quality)
+    return _gather(world, chains, parts, keep_failed=False, twins=True)
+
+
+def _parts(
+    world: World,
+    chains: Chains,
+    ends: tuple[Float[Tensor, "t 3"], Float[Tensor, "r 3"]],
+    wavelength: float,
+    quality: Quality,
+) -> list[tuple[Tensor, Solved]]:
+    """Chains of one depth at a time: their rows, and what became of them."""
+    tx_position, rx_position = ends
     depth_of = (chains.which >= 0).sum(1)
     most = chains.which.shape[1]
     mirrors = mirrors_of(world)
@@ -83,7 +112,7 @@ def solve(
                 chains.seed[i, :depth],
             )
             parts.append((i, _pad(_one_way(world, mirrors, batch, wavelength, quality), most)))
-    return _gather(world, chains, parts, most, wavelength, keep_failed)
+    return parts
 
 
 def _one_way(
@@ -410,11 +439,10 @@ def _gather(
     world: World,
     chains: Chains,
     parts: list[tuple[Tensor, Solved]],
-    most: int,
-    wavelength: float,
     keep_failed: bool,
-) -> tuple[Paths, dict[Status, int]]:
-    device = chains.tx.device
+    twins: bool,
+) -> tuple[Paths, Int[Tensor, "c"]]:
+    device, most = chains.tx.device, chains.which.shape[1]
     if not parts:
         empty = torch.zeros(0, dtype=torch.float64, device=device)
         blank = Solved(
@@ -431,11 +459,10 @@ def _gather(
         *(torch.cat([getattr(s, n) for _, s in parts])[order] for n in Solved.__dataclass_fields__)
     )
     good = (whole.status == int(Status.OK)) | (whole.status == int(Status.CAUSTIC_CAPPED))
-    twin = coincident(world, chains, whole.vertices, whole.normal, good)
-    whole.status[twin] = int(Status.DUPLICATE)
-    good &= ~twin
-    numbers = torch.bincount(whole.status, minlength=len(Status)).tolist()
-    counts = {s: numbers[s] for s in Status if numbers[s]}
+    if not twins:
+        twin = coincident(world, chains, whole.vertices, whole.normal, good)
+        whole.status[twin] = int(Status.DUPLICATE)
+        good &= ~twin
     keep = torch.nonzero(good | keep_failed).squeeze(-1)
     vertices = whole.vertices[keep]
     return (
@@ -453,5 +480,5 @@ def _gather(
             whole.caustics[keep],
             whole.status[keep],
         ),
-        counts,
+        whole.status,
     )

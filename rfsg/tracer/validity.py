@@ -50,6 +50,7 @@ def sentences(world: World, frequency: Float[Tensor, "f"]) -> tuple[str, ...]:
         _close_radios(world, wavelength),
         *_surfaces_near_radios(world, wavelength),
         *_extrapolated(world, frequency),
+        *_beyond_learned(world, frequency),
     )
     return tuple(s for s in said if s)
 
@@ -248,6 +249,31 @@ def _extrapolated(world: World, frequency: Tensor) -> list[str]:
             what = f"{name} at {at} GHz is an extrapolation: {media.bands(name)}"
             found.append(_sentence(paths, what))
     return found
+
+
+def _beyond_learned(world: World, frequency: Tensor) -> list[str]:
+    """One sentence for each band that objects were learned at and that a frequency lies beyond."""
+    users: dict[tuple[float, float], list[str]] = {}
+    for node in world.scene.nodes:
+        if node.body.band is not None:
+            users.setdefault(node.body.band, []).append(node.path)
+    lowest, highest = float(frequency.min()), float(frequency.max())
+    found = []
+    for (low, high), paths in users.items():
+        off = []
+        if lowest < low:
+            off.append(f"{lowest / 1e9:g} GHz lies {_apart(low - lowest, low)} below")
+        if highest > high:
+            off.append(f"{highest / 1e9:g} GHz lies {_apart(highest - high, high)} above")
+        if off:
+            band = f"{low / 1e9:g} GHz" if low == high else f"{low / 1e9:g} to {high / 1e9:g} GHz"
+            what = f"learned at {band}: {' and '.join(off)}, where what they answer is an extrapolation"
+            found.append(_sentence(paths, what))
+    return found
+
+
+def _apart(difference: float, of: float) -> str:
+    return f"{difference / 1e9:.3g} GHz ({100.0 * difference / of:.3g} %)"
 
 
 def _about(world: World, which: Int[Tensor, "m"], what: str) -> str:

@@ -24,6 +24,7 @@ from rfsg.scene.world import World, unit
 from rfsg.tracer.feet import Asked, Feet
 
 RELIEF = 1.0 / 16.0  # of a wavelength: what a mirror may depart from its quadric (Rayleigh's half)
+SKETCHED = 1.0 / 64.0  # of a wavelength: what sketches of networks may err by
 ALIGNED = (0.64, 0.87)  # cosines of 50 and 30 degrees: below the first a sample is another face
 SHRINKS = (1.0, 0.5, 0.25)  # zone radii tried, largest first
 HELD = (
@@ -102,9 +103,12 @@ def measure(
 ) -> Facets:
     """Fit the quadric of each vertex's zone: of the zones tried, largest first, those that are mirrors.
 
-    ``dtype`` is the precision of the network's evaluation. Frames are laid out in the
-    object's own frame, so moving the whole scene moves the answer and changes nothing else.
+    ``dtype`` is the precision of the network's evaluation; in float32 its sketch will do, where that is
+    good enough. Frames are laid out in the object's own frame, so moving the whole scene moves the
+    answer and changes nothing else.
     """
+    if dtype == torch.float32:
+        world = world.sketched(SKETCHED * wavelength)
     zones = Zones(world, which, centre, normal, radius, wavelength, rings)
     return zones.fitted(Asked(world, which, dtype))
 

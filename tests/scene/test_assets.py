@@ -11,7 +11,7 @@ from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.stochastic import StochasticSurface
 from rfsg.scene import usd
 from rfsg.scene.assets import load_asset, save_asset
-from rfsg.scene.fields import NEURAL
+from rfsg.scene.fields import BAND, NEURAL
 from rfsg.scene.scene import SceneError
 from rfsg.scene.weights import pack, same_bits
 
@@ -52,7 +52,7 @@ def test_the_usd_file_is_what_other_programs_expect(small_asset):
     assert (root.GetName(), Usd.ModelAPI(root).GetKind()) == ("cabinet", "component")
     assert (UsdGeom.GetStageMetersPerUnit(stage), UsdGeom.GetStageUpAxis(stage)) == (1.0, "Z")
     attributes = root.GetAuthoredPropertiesInNamespace("rfsg")
-    assert {a.GetName() for a in attributes} == {f.name for f in NEURAL}
+    assert {a.GetName() for a in attributes} == {f.name for f in NEURAL if f not in BAND}
     spec = stage.GetRootLayer().GetPrimAtPath(root.GetPath())
     assert all(a.custom for a in spec.attributes)
     mesh = UsdGeom.Mesh(root.GetChild("Surface"))

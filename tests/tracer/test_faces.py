@@ -9,7 +9,7 @@ from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World
 from rfsg.tracer.faces import planes_of
-from rfsg.tracer.sequences import Prefixes, _visible
+from rfsg.tracer.prefixes import Prefixes, visible
 from tests.scenes import vector
 
 MIRROR = torch.diag(vector(1.0, -1.0, 1.0))
@@ -67,7 +67,7 @@ def test_which_faces_may_come_next_against_a_plain_loop():
     faces = planes_of(scene)
     generator = torch.Generator().manual_seed(1)
     last = torch.randint(len(faces), (40, 2), generator=generator)
-    found = _visible(faces, Prefixes(torch.zeros(40, 3, dtype=torch.float64), last))
+    found = visible(faces, Prefixes(torch.zeros(40, 3, dtype=torch.float64), last))
     corners = faces.corners()
     for row, k in enumerate(last[:, 1].tolist()):
         for face in range(len(faces)):

@@ -14,8 +14,10 @@ from rfsg.tracer.faces import Looks, Samples, samples_of
 from rfsg.tracer.glances import astray, stationary
 from rfsg.tracer.glints import ALIKE, BESIDE, NEAR, _good, glints, may_glint
 from rfsg.tracer.launch import fibonacci
+from rfsg.tracer.newton import Batch
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.sequences import enumerate_chains
+from rfsg.tracer.settle import Settling, _round, _start
 from rfsg.tracer.zone import Facets
 from tests.scenes import vector
 from tests.test_lab import ASSETS
@@ -196,7 +198,7 @@ def test_the_stationary_path_over_a_quadric():
     )
     ends = torch.randn(2, 30, 3, generator=generator, dtype=torch.float64)
     ends[..., 2] = 3.0 + ends[..., 2].abs()
-    found = stationary(facets, torch.zeros(30, 3, dtype=torch.float64), ends[0], ends[1])
+    found, _ = stationary(facets, torch.zeros(30, 3, dtype=torch.float64), ends[0], ends[1])
 
     def length(uv: torch.Tensor) -> torch.Tensor:
         height = (facets.slope * uv).sum(-1)
@@ -219,7 +221,7 @@ def test_the_stationary_path_over_a_quadric():
 def test_a_plane_mirrors_where_the_image_method_says():
     flat = _facets(*(torch.zeros(1, *s, dtype=torch.float64) for s in ((), (2,), (2, 2))))
     fore, aft = vector(0.0, 0.0, 1.0)[None], vector(4.0, 2.0, 3.0)[None]
-    found = stationary(flat, torch.zeros(1, 3, dtype=torch.float64), fore, aft)
+    found, _ = stationary(flat, torch.zeros(1, 3, dtype=torch.float64), fore, aft)
     torch.testing.assert_close(found, vector(1.0, 0.5, 0.0)[None])
 
 
@@ -238,3 +240,22 @@ def test_a_first_look_leaves_glints_on_a_flat_side_and_drops_those_far_past_it()
     assert not bool(astray(looks, sample, fore, aft))
     beside = foot + 3.0 * normal + 9.0 * side, foot + 3.0 * normal + 7.0 * side
     assert bool(astray(looks, sample, *beside))
+
+
+@pytest.mark.parametrize("name", ["cabinet", "person"])
+@torch.no_grad()
+def test_what_a_first_look_drops_settling_would_give_up_at_once(name):
+    """The plain twin: each candidate as a chain, after the first look that settling takes itself."""
+    shape = _learned(name)
+    item, looks = _samples(shape), Looks(shape, torch.device("cpu"), WAVELENGTH)
+    fore, aft = _images(item, 80, seed=5)
+    pair, sample = glints(item, fore, aft)
+    dropped = astray(looks, sample, fore[pair], aft[pair])
+    assert bool(dropped.any()) and not bool(dropped.all())
+    node = Node("/item", Body(shape, Conductor()), Pose.identity())
+    world, none = World(Scene((node,))), torch.zeros(len(pair), 1, dtype=torch.int64)
+    x = item.point[sample][:, None]
+    batch = Batch(pair, fore[pair], aft[pair], none, item.patch[sample][:, None], x)
+    settling = Settling(world, WAVELENGTH, Quality())
+    left, _ = _round(settling, batch, _start(world, batch), torch.arange(len(pair)), look=True)
+    assert not bool(dropped[left].any())

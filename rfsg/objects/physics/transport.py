@@ -120,9 +120,7 @@ def law_named(name: str) -> Law:
 
 def gradient_norm(gradient: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
     """|grad f|, with gradient 0 instead of NaN where it vanishes."""
-    square = gradient.square().sum(-1)
-    zero = square == 0
-    return torch.where(zero, square, torch.where(zero, 1.0, square).sqrt())
+    return torch.linalg.vector_norm(gradient, dim=-1)
 
 
 def sigma_mix(alpha: Float[Tensor, "*b"], cosine: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -143,8 +141,7 @@ def sigma_inside(
     ``slope`` = |grad f|, ``mix`` = sigma_mix. Evaluated outside it tends to s, an opaque free
     space: the sign of f is for the caller to heed.
     """
-    u = sharpness * f
-    return (m * law.occupancy(u) + 1) * sharpness * law.hazard(u) * slope * mix
+    return _sigma(law, sharpness * f, slope, m, mix, sharpness)
 
 
 def sigma_outside(
@@ -156,12 +153,32 @@ def sigma_outside(
     sharpness: Float[Tensor, ""],
 ) -> Float[Tensor, "*b"]:
     """sigma_out [1/m] (Eq. 14) of points outside, f >= 0: sigma_inside with f mirrored."""
-    return sigma_inside(law, -f, slope, m, mix, sharpness)
+    return _sigma(law, -sharpness * f, slope, m, mix, sharpness)
+
+
+def sigma_at_face(
+    law: Law,
+    slope: Float[Tensor, "*b"],
+    m: Float[Tensor, "*b"],
+    mix: Float[Tensor, "*b"],
+    sharpness: Float[Tensor, ""],
+) -> Float[Tensor, "*b"]:
+    """sigma_in and sigma_out [1/m] where f = 0, and they are the same."""
+    return _sigma(law, sharpness.new_zeros(()), slope, m, mix, sharpness)
+
+
+def _sigma(law: Law, u: Tensor, slope: Tensor, m: Tensor, mix: Tensor, sharpness: Tensor) -> Tensor:
+    return (m * law.occupancy(u) + 1) * (sharpness * law.hazard(u)) * slope * mix
 
 
 def phasor(phi: Float[Tensor, "*b"]) -> Complex[Tensor, "*b"]:
     """e^{j phi} for phi in [-pi/2, pi/2], its real part kept from rounding below 0 (passivity)."""
-    return torch.complex(phi.cos().clamp(min=0.0), phi.sin())
+    return torch.complex(in_phase(phi), phi.sin())
+
+
+def in_phase(phi: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """The real part of ``phasor``."""
+    return phi.cos().clamp(min=0.0)
 
 
 IN_FACE = 1e-9  # [m] a stretch that runs in a face, but for rounding, is inside
@@ -189,16 +206,18 @@ def telescoped(
     u = sharpness * f
     inside = u.clamp(max=0.0)
     log_o, v = law.log_occupancy(inside), law.vacancy(inside)
-    d_log_o, d_o = _difference(log_o), _difference(v)
-    mean_hazard, mean_density = _means(law, u, d_log_o, d_o)
-    m_bar, alpha_bar, phi_bar = _mean(m), _mean(alpha), _mean(phi)
-    across = alpha_bar * (m_bar * d_o.abs() + d_log_o.abs())
-    slope = _mean(gradient_norm(gradient))
+    du, d_log_o, d_v = _difference(torch.stack([u, log_o, v])).unbind()
+    mean_hazard, mean_density = _means(law, _mean(u), du, d_log_o, d_v)
+    fields = torch.stack([m, alpha, phi, gradient_norm(gradient)])
+    m_bar, alpha_bar, phi_bar, slope = _mean(fields).unbind()
+    across = alpha_bar * (m_bar * d_v.abs() + d_log_o.abs())
     isotropic = (m_bar * mean_density + mean_hazard) * sharpness * slope
     along = 0.5 * (1 - alpha_bar) * isotropic
     if kappa is not None:
         along = along + _mean(kappa * torch.where(f <= IN_FACE, log_o.exp(), 0.0))
-    return _symmetric_sum((across + along * step[..., None]) * phasor(phi_bar))
+    depth = across + along * step[..., None]
+    turned = depth * torch.stack([in_phase(phi_bar), phi_bar.sin()])
+    return torch.complex(*_symmetric_sum(turned).unbind())
 
 
 def riemann(
@@ -239,30 +258,25 @@ def _mean(x: Tensor) -> Tensor:
     return 0.5 * (x[..., 1:] + x[..., :-1])
 
 
-def _means(law: Law, u: Tensor, d_log_o: Tensor, d_v: Tensor) -> tuple[Tensor, Tensor]:
+def _means(
+    law: Law, middle: Tensor, du: Tensor, d_log_o: Tensor, d_v: Tensor
+) -> tuple[Tensor, Tensor]:
     """Means of H(u) and o H = psi(u) over each interval, u linear, the part outside as 0."""
-    du = _difference(u)
     near = du.abs() < DIVIDED_DIFFERENCE_MIN
-    safe = torch.where(near, 1.0, du)
-    hazard, density = _gauss(law, u, du)
-    return (
-        torch.where(near, hazard, -d_log_o / safe),
-        torch.where(near, density, d_v / safe),
-    )
+    divided = torch.stack([-d_log_o, d_v]) / torch.where(near, 1.0, du)
+    hazard, density = torch.where(near, _gauss(law, middle, du), divided).unbind()
+    return hazard, density
 
 
-def _gauss(law: Law, u: Tensor, du: Tensor) -> tuple[Tensor, Tensor]:
-    middle, offset = _mean(u), _GAUSS_NODE * du
+def _gauss(law: Law, middle: Tensor, du: Tensor) -> Tensor:
+    """Both by three Gauss nodes of each interval, stacked."""
+    offset = _GAUSS_NODE * du
     nodes = torch.stack([middle - offset, middle, middle + offset])
     counted = nodes <= 0
     nodes = nodes.clamp(max=0.0)
     hazard = torch.where(counted, law.hazard(nodes), 0.0)
-    density = law.occupancy(nodes) * hazard
-    return _gauss_sum(hazard), _gauss_sum(density)
-
-
-def _gauss_sum(x: Tensor) -> Tensor:
-    return (5 / 18) * (x[0] + x[2]) + (8 / 18) * x[1]  # the same bits either way round
+    first, middle, last = torch.stack([hazard, law.occupancy(nodes) * hazard], 1).unbind()
+    return (5 / 18) * (first + last) + (8 / 18) * middle  # the same bits either way round
 
 
 def _symmetric_sum(x: Tensor) -> Tensor:

@@ -2,51 +2,39 @@
 
 - the zero mesh (f = 0) with the gradient at its vertices: where a ray hits, nearly, and how steeply f
   falls there;
-- a closed shell outside it, f = level: a ray that misses it misses the object. Marching cubes keeps
-  every cell whose corners are below the level, so none of the surface is lost when that is
-  sqrt(3) L h (h the grid step, L a bound on |grad f| near the surface), or, which is less, more than
-  interpolated values err by wherever the surface may be;
 - values of f on a grid near the surface, in blocks, with a bound on the error of interpolation in
-  each: far enough from the surface they tell the sign of f and a step that skips nothing.
+  each cell: far enough from the surface they tell the sign of f and a step that skips nothing; and
+  with one on how much the slope of f changes nearby, which tells that a root is the only one;
+- a closed shell outside it, as near as these errors allow: a ray that misses it misses the object;
+- what hits of the stand-ins are wrong by (``offs``).
 
-Both bounds are tested, not proven: formal ones are useless for such a network at any practical size.
+All bounds are tested, not proven: formal ones are useless for such a network at any practical size.
 """
 
 import hashlib
 import json
-import math
 from dataclasses import replace
 
-import numpy as np
 import torch
-from jaxtyping import Float
-from numpy import ndarray
-from torch import Tensor
 from torch.nn import functional as F
 
 from rfsg.objects.contract import Shape
-from rfsg.objects.shapes.band import BLOCK, Baked, Surface
-from rfsg.objects.shapes.proxy import (
-    FINEST,
-    Sampled,
-    field_at,
-    level_set,
-    sample_field,
-    simplified,
-)
+from rfsg.objects.shapes.band import BLOCK, LEAST_TURN, Baked, Surface
+from rfsg.objects.shapes.blocks import BEND_SAFETY, CREASE, blocks, corners, places, rounded_up
+from rfsg.objects.shapes.offs import measured_offs
+from rfsg.objects.shapes.proxy import FINEST, field_at, level_set, sample_field
 from rfsg.objects.shapes.refined import newton, refined
+from rfsg.objects.shapes.shell import SAFETY, shelled
 
-VERSION = 1  # of the extraction: part of the key
+VERSION = 2  # of the extraction: part of the key
 COARSEST = 0.005  # [m]
 CELLS = 200  # along the longest side, unless that makes them coarser or finer than allowed
-SHELL_MOVED = 0.25  # [grid steps] that the shell may be moved by to save triangles
-SAFETY = 1.25  # of the slope bound over the steepest found, as in ``compute_lipschitz``
+BAND = 2.0  # [grid steps] that f, at its steepest, may change by where it is sampled finely
 CHORD, SPLITS = 5e-5, 3  # [m] edges of the zero mesh further from the surface are split; times
-ROUNDING = 1e-6  # [m] of a network in float32
-CREASE = 2e-4  # [m] errors above this are measured
 MIDDLE_SAFETY = 2.5  # of the error at the middles of a cell and its neighbours,
 OFF_MIDDLE = 0.1  # and the share of the bound that stays all the same
-BEND_SAFETY = 1.5  # of the error bound of interpolation over what second differences say
+CLOSER = (0.1, 0.5, 0.9)  # of a cell's side, where errors at creases are measured again,
+CLOSER_SAFETY = 1.5  # and of the largest of these
 TESTED = 16_384  # points that slope and error bounds are tested on
 MOST_NODES = 20_000_000  # of a grid, before its step grows
 
@@ -68,15 +56,14 @@ def bake(shape: Shape, step: float | None = None) -> Baked:
     """
     step = step or default_step(shape)
     slope = SAFETY * _steepest(shape, 4.0 * step)
-    margin = slope * (math.sqrt(3.0) + SHELL_MOVED) * step
+    margin = slope * BAND * step
     sampled = sample_field(shape, step, margin)
-    number, values, error = _blocks(sampled)
+    number, values, error, turn = blocks(sampled)
     vertices, triangles = (torch.from_numpy(x) for x in level_set(sampled, 0.0))
     point, triangles, gradient = refined(shape, vertices.float(), triangles, step, CHORD, SPLITS)
     found = Baked(
         key_of(shape, step),
         step,
-        margin,
         margin,
         slope,
         float(getattr(shape, "lipschitz", slope)),
@@ -88,20 +75,14 @@ def bake(shape: Shape, step: float | None = None) -> Baked:
         sampled.middle.float(),
         values,
         error,
+        turn,
+        {},
     )
-    return _in_shell(sampled, _tested(shape, _measured(shape, found)))
-
-
-def _in_shell(sampled: Sampled, found: Baked) -> Baked:
-    """The same in the tightest shell that its errors allow, in place of the one it came with."""
-    moved = SHELL_MOVED * found.step
-    least = _corners(found).abs().amin(0)
-    worst = found.error[least <= found.error]
-    level = SAFETY * float(worst.max()) + found.slope * moved if len(worst) else found.margin
-    level = min(level, found.margin)
-    vertices, triangles = simplified(*level_set(sampled, level), moved)
-    shell = Surface(torch.from_numpy(vertices).float(), torch.from_numpy(triangles).int())
-    return replace(found, level=level, shell=shell)
+    found = _closer(shape, _measured(shape, found))
+    found = _turned(shape, _tested(shape, found))
+    found = replace(found, error=rounded_up(found.error), turn=rounded_up(found.turn))
+    found = shelled(sampled, found)
+    return replace(found, offs=measured_offs(shape, found))
 
 
 def key_of(shape: Shape, step: float) -> str:
@@ -129,63 +110,41 @@ def _steepest(shape: Shape, reach: float) -> float:
     return float(shape.value_and_gradient(point)[1].norm(dim=-1).max())
 
 
-def _blocks(sampled: Sampled) -> tuple[Tensor, Tensor, Tensor]:
-    """Number of each busy block, its nodes' values, and the error of interpolating them."""
-    counts, side = sampled.busy.shape, BLOCK + 1
-    values = sampled.values.astype(np.float32)
-    windows = np.lib.stride_tricks.sliding_window_view(values, (side,) * 3)
-    busy = sampled.busy.numpy()
-    nodes = windows[::BLOCK, ::BLOCK, ::BLOCK][busy]
-    number = torch.full(counts, -1, dtype=torch.int32)
-    number[sampled.busy] = torch.arange(len(nodes), dtype=torch.int32)
-    cells = _bend(values).reshape([n for count in counts for n in (count, BLOCK)])
-    cells = cells.transpose(0, 2, 4, 1, 3, 5)[busy].reshape(len(nodes), -1)
-    bend = torch.from_numpy(cells)
-    smooth = BEND_SAFETY / 8.0 * bend
-    # at a crease linear interpolation may err by half a second difference, not by an eighth
-    error = torch.where(smooth < CREASE, smooth, 0.5 * bend).add_(ROUNDING)
-    return number, torch.from_numpy(nodes.reshape(len(nodes), -1)), error
-
-
-def _bend(values: Float[ndarray, "x y z"]) -> Float[ndarray, "x-1 y-1 z-1"]:
-    """Sum over axes of the largest second difference at a cell's corners [m]. An eighth of it is what
-    linear interpolation in each axis errs by; the mixed second derivatives it has right."""
-    total = np.zeros([n - 1 for n in values.shape], dtype=np.float32)
-    for axis in range(3):
-        ends = [(1, 1) if k == axis else (0, 0) for k in range(3)]
-        bend = np.pad(np.abs(np.diff(values, 2, axis)), ends, "edge")
-        for along in range(3):
-            one, other = (np.moveaxis(bend, along, 0)[part] for part in (slice(-1), slice(1, None)))
-            bend = np.moveaxis(np.maximum(one, other), 0, along)
-        total += bend
-    return total
-
-
 def _measured(shape: Shape, found: Baked) -> Baked:
     """The same, with errors at creases, which second differences overstate, measured at the middles of
     cells instead: of those that the surface may be in."""
-    k, corners = len(found.values), _corners(found)
-    mean, least = corners.mean(0), corners.abs().amin(0)
-    some = (found.error > CREASE) & (least < 2.0 * found.error)
+    k, ends = len(found.values), corners(found)
+    some = (found.error > CREASE) & (ends.abs().amin(0) < 2.0 * found.error)
     block, cell = torch.nonzero(some, as_tuple=True)
-    home = torch.empty(k, 3)
-    home[found.block[found.block >= 0].long()] = torch.nonzero(found.block >= 0).float()
-    offset = torch.cartesian_prod(*[torch.arange(BLOCK)] * 3)[cell]
-    point = found.low + found.step * (BLOCK * home[block] + offset + 0.5)
+    point = places(found, block, cell) + 0.5 * found.step
     off = torch.zeros_like(found.error)
-    off[block, cell] = (field_at(shape, point).float() - mean[block, cell]).abs()
+    off[block, cell] = (field_at(shape, point).float() - ends.mean(0)[block, cell]).abs()
     # a crease may be at its worst beside the middle: the worst of the neighbours, and a margin
     spread = F.max_pool3d(off.view(k, 1, BLOCK, BLOCK, BLOCK), 3, 1, 1).view(k, -1)
     measured = MIDDLE_SAFETY * spread + OFF_MIDDLE * found.error
     return replace(found, error=torch.where(some, measured, found.error))
 
 
-def _corners(found: Baked) -> Float[Tensor, "8 k c"]:
-    """Values at the corners of all cells."""
-    k, side = len(found.values), BLOCK + 1
-    nodes = found.values.view(k, side, side, side)
-    ends = (slice(0, BLOCK), slice(1, side))
-    return torch.stack([nodes[:, x, y, z].reshape(k, -1) for x in ends for y in ends for z in ends])
+def _closer(shape: Shape, found: Baked) -> Baked:
+    """The same, with errors at creases measured at 27 places of each cell that the surface may still be
+    in: they decide how near the shell comes, and how often rays ask the network."""
+    ends = corners(found)
+    doubtful = (ends.amin(0) <= found.error) & (ends.amax(0) >= -found.error)
+    block, cell = torch.nonzero(doubtful & (found.error > CREASE), as_tuple=True)
+    if not len(block):
+        return found
+    share = torch.cartesian_prod(*[torch.tensor(CLOSER)] * 3)
+    point = places(found, block, cell)[:, None] + found.step * share
+    value = field_at(shape, point.reshape(-1, 3)).float().view(len(block), -1)
+    sides = torch.stack([1.0 - share, share])  # weights of low and high corners, by axis
+    x, y, z = sides.unbind(-1)
+    weight = (x[:, None, None] * y[:, None] * z).flatten(0, 2)
+    worst = (value - ends[:, block, cell].t() @ weight).abs().amax(1)
+    error = found.error.clone()
+    error[block, cell] = torch.minimum(
+        CLOSER_SAFETY * worst + OFF_MIDDLE * error[block, cell], error[block, cell]
+    )
+    return replace(found, error=error)
 
 
 def _tested(shape: Shape, found: Baked) -> Baked:
@@ -202,3 +161,19 @@ def _tested(shape: Shape, found: Baked) -> Baked:
     worst = [float(short[some].max()) if bool(some.any()) else 0.0 for some in (~uneven, uneven)]
     even, rough = (SAFETY * w if w > 1.0 else 1.0 for w in worst)
     return replace(found, error=found.error * torch.where(found.error > CREASE, rough, even))
+
+
+def _turned(shape: Shape, found: Baked) -> Baked:
+    """The same, ``turn`` raised to what lines from the surface need, should it not hold there."""
+    generator = torch.Generator().manual_seed(5)
+    count = min(TESTED, len(found.zero.vertices))
+    some = torch.randperm(len(found.zero.vertices), generator=generator)[:count]
+    direction = F.normalize(torch.randn(count, 3, generator=generator), dim=-1)
+    length = torch.rand(count, generator=generator)
+    low, high = shape.bounds().float()
+    ends = found.zero.vertices[some]
+    ends = torch.stack([ends, ends + found.step * length[:, None] * direction]).to(low)
+    slope = (shape.value_and_gradient(ends.clamp(low, high))[1].cpu() * direction).sum(-1)
+    allowed = found.look_about(ends[0].cpu())[2] * length.clamp(min=LEAST_TURN)
+    worst = float(((slope[1] - slope[0]).abs() / allowed).max())
+    return replace(found, turn=found.turn * SAFETY * worst) if worst > 1.0 else found

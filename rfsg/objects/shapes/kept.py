@@ -6,7 +6,8 @@ A file is never needed: where it is missing, spoiled or cannot be written, the s
 import json
 import os
 import warnings
-from dataclasses import dataclass
+from collections import OrderedDict
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from rfsg.objects.contract import Shape
-from rfsg.objects.shapes.band import BLOCK, Baked, Surface
+from rfsg.objects.shapes.band import BLOCK, WAYS, Baked, Off, Surface
 
 MOST_KEPT = 16
 MAX_BYTES = 512 * 2**20  # of a file: ten times what a 2 m object takes at 5 mm
@@ -24,7 +25,8 @@ MAX_HEADER_BYTES = 2**16
 ENDING = ".baked.safetensors"
 BAKE_AFTER = 50_000  # rays that a question launches before baking its shapes pays
 
-_NUMBERS = ("step", "margin", "level", "slope", "lipschitz")
+_NUMBERS = ("step", "margin", "slope", "lipschitz")
+_OFF = tuple(field.name for field in fields(Off))
 # name: (dtype, number of dimensions)
 _TENSORS = {
     "zero.vertices": (torch.float32, 2),
@@ -36,7 +38,8 @@ _TENSORS = {
     "block": (torch.int32, 3),
     "middle": (torch.float32, 3),
     "values": (torch.float32, 2),
-    "error": (torch.float32, 2),
+    "error": (torch.float16, 2),
+    "turn": (torch.float16, 2),
 }
 
 
@@ -47,7 +50,7 @@ class _Kept:
     refused: bool = False
 
 
-_MEMORY: dict[int, _Kept] = {}
+_MEMORY: OrderedDict[int, _Kept] = OrderedDict()  # the one asked last stands last
 
 
 def bake(shape: Shape, step: float | None = None) -> Baked:
@@ -97,6 +100,25 @@ def baked_if_it_pays(shape: Shape, rays: int) -> Baked | None:
     return kept.baked
 
 
+def offs_of(shape: Shape) -> dict[str, Off] | None:
+    """What each way to meet a baked shape errs by, if it is kept, in memory or on disk; else None."""
+    kept = _MEMORY.get(id(shape))
+    if kept is not None and kept.state == state_of(shape) and kept.baked is not None:
+        return kept.baked.offs
+    folder = getattr(shape, "folder", None)
+    if folder is None or not any(Path(folder).glob(f"*{ENDING}")):
+        return None
+    from rfsg.objects.shapes.baked import default_step, key_of
+
+    key = key_of(shape, default_step(shape))
+    try:
+        with (Path(folder) / f"{key[:32]}{ENDING}").open("rb") as file:
+            head = _head(file.read(8 + MAX_HEADER_BYTES))
+        return _offs(head["offs"]) if head.get("key") == key else None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None  # missing or spoiled: who reads all of it says so
+
+
 def state_of(shape: Shape) -> tuple:
     """Changes when a parameter of the shape does. It holds the shape, so that its id is no other's."""
     parameters = list(getattr(shape, "parameters", list)())
@@ -107,15 +129,17 @@ def _of(shape: Shape) -> _Kept:
     state = state_of(shape)
     kept = _MEMORY.get(id(shape))
     if kept is None or kept.state != state:
-        if len(_MEMORY) >= MOST_KEPT:
-            _MEMORY.clear()
         kept = _MEMORY[id(shape)] = _Kept(state)
+    _MEMORY.move_to_end(id(shape))
+    if len(_MEMORY) > MOST_KEPT:
+        _MEMORY.popitem(last=False)
     return kept
 
 
 def _write(path: Path, found: Baked) -> None:
     head = {"key": found.key} | {name: getattr(found, name) for name in _NUMBERS}
-    tensors = {name: _part(found, name).contiguous().clone() for name in _TENSORS}
+    head |= {"offs": {way: asdict(off) for way, off in found.offs.items()}}
+    tensors = {name: tensor.contiguous().clone() for name, tensor in tensors_of(found).items()}
     data = save(tensors, metadata={"rfsg-baked": json.dumps(head, sort_keys=True)})
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -128,6 +152,11 @@ def _write(path: Path, found: Baked) -> None:
             beside.unlink(missing_ok=True)
         except OSError:
             pass
+
+
+def tensors_of(found: Baked) -> dict[str, Tensor]:
+    """What a file of it holds, by name."""
+    return {name: _part(found, name) for name in _TENSORS}
 
 
 def _part(found: Baked, name: str) -> Tensor:
@@ -187,7 +216,19 @@ def _built(head: dict[str, Any], given: dict[str, Tensor]) -> Baked:
         middle=t["middle"],
         values=t["values"],
         error=t["error"],
+        turn=t["turn"],
+        offs=_offs(head["offs"]),
     )
+
+
+def _offs(given: Any) -> dict[str, Off]:
+    if not isinstance(given, dict) or given.keys() != set(WAYS):
+        raise ValueError(f"says what it errs by as {given!r}: expected {', '.join(WAYS)}")
+    offs = {way: Off(*(float(given[way][n]) for n in _OFF)) for way in WAYS}
+    for way, off in offs.items():
+        if not (0.0 <= off.usual <= off.most < 1e6 and 0.0 <= off.lost <= 1.0):
+            raise ValueError(f"says that {way!r} errs by {off}")
+    return offs
 
 
 def _check_sizes(t: dict[str, Tensor]) -> None:
@@ -202,7 +243,8 @@ def _check_sizes(t: dict[str, Tensor]) -> None:
     _expect("low", t["low"], (3,))
     _expect("middle", t["middle"], tuple(t["block"].shape))
     _expect("values", t["values"], (count, (BLOCK + 1) ** 3))
-    _expect("error", t["error"], (count, BLOCK**3))
+    for name in ("error", "turn"):
+        _expect(name, t[name], (count, BLOCK**3))
     _within("block", t["block"], -1, count)
 
 

@@ -10,8 +10,9 @@ Facets of a round thing are mirrors of their own: learn it (`rfsg learn-shape`),
 the round shapes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from rfsg.objects.shapes.topology import LEVEL, closed_mesh
 CHUNK = 1_000_000  # pairs of a point and a triangle or an edge at a time: some 100 MB in all
 INSIDE = 1e-12  # of a triangle's sides: a point above the very rim is above the triangle
 BRIEF = 1e-9  # [m] two crossings nearer than this are one; nothing deeper is missed
+Made = TypeVar("Made")
 SHALLOW = 2.5e-9  # [m] a line no deeper than this runs in a face, not inside
 
 
@@ -44,8 +46,9 @@ class Mesh(nn.Module):
 
     Corners at one place are one corner, and a mesh that is inside out is turned. ``vertices`` are
     float64 and ask for no gradient until told to; planes, edges and distances follow them as long as
-    faces stay flat. Raises ValueError for a mesh that is not closed, not wound in one sense, or has
-    triangles without area.
+    faces stay flat. ``sheet``: both sides of a surface without an inside instead, which need not be
+    closed (``sheet.Sheet``). Raises ValueError for a mesh that is not closed, not wound in one sense, or
+    has triangles without area.
     """
 
     kind = "mesh"
@@ -58,12 +61,21 @@ class Mesh(nn.Module):
     sides: Tensor
     _triangle_of_face: Tensor
 
+    def __new__(cls, vertices: Any = (), triangles: Any = (), sheet: bool = False) -> "Mesh":
+        if sheet and cls is Mesh:  # files know both as meshes
+            from rfsg.objects.shapes.sheet import Sheet
+
+            return object.__new__(Sheet)
+        return super().__new__(cls)
+
     def __init__(
         self,
         vertices: Sequence[Sequence[float]] | np.ndarray | Tensor,
         triangles: Sequence[Sequence[int]] | np.ndarray | Tensor,
+        sheet: bool = False,
     ):
         super().__init__()
+        self._tables: dict[str, Any] = {}
         made = closed_mesh(np.asarray(vertices), np.asarray(triangles))
         self.vertices = nn.Parameter(torch.from_numpy(made.vertices), requires_grad=False)
         for name in ("triangles", "face", "ends", "sides"):
@@ -83,6 +95,20 @@ class Mesh(nn.Module):
 
     def planes(self) -> Float[Tensor, "k 4"]:
         """The mean plane of each face, weighted by area."""
+        return self._kept("planes", self._mean_planes)
+
+    def _kept(self, name: str, make: Callable[[], Made]) -> Made:
+        """What follows from the vertices alone, made once while they stay and nobody fits them."""
+        if self.vertices.requires_grad:
+            return make()
+        at = (self.vertices.data_ptr(), self.vertices._version)
+        if self._tables.get("at") != at:
+            self._tables = {"at": at}
+        if name not in self._tables:
+            self._tables[name] = make()
+        return self._tables[name]
+
+    def _mean_planes(self) -> Float[Tensor, "k 4"]:
         a, b, c = self.vertices[self.triangles].unbind(1)
         cross = torch.linalg.cross(b - a, c - a)
         total = cross.new_zeros(self._faces, 3).index_add(0, self.face, cross)
@@ -324,7 +350,7 @@ class Mesh(nn.Module):
         parts = []
         for some in point.detach().split(max(1, CHUNK // count)):
             above = self._above(some, planes, frames)
-            away, share = _beside(some, start.to(some), (stop - start).to(some))
+            away, share = beside_segments(some, start.to(some), (stop - start).to(some))
             feature = torch.cat([above, away], 1).argmin(1)
             edge = (feature - above.shape[1]).clamp(min=0)
             parts.append((feature, share.gather(1, edge[:, None]).squeeze(1)))
@@ -345,6 +371,9 @@ class Mesh(nn.Module):
 
     def _frames(self) -> tuple[Tensor, Tensor, Tensor]:
         """First corner of every triangle, and two vectors that give a point's shares of its sides."""
+        return self._kept("frames", self._made_frames)
+
+    def _made_frames(self) -> tuple[Tensor, Tensor, Tensor]:
         a, b, c = self.vertices[self.triangles].unbind(1)
         first, second = b - a, c - a
         aa, ab, bb = (
@@ -357,7 +386,7 @@ class Mesh(nn.Module):
 
     @property
     def _faces(self) -> int:
-        return int(self.face.max()) + 1
+        return self._kept("faces", lambda: int(self.face.max()) + 1)
 
     @torch.no_grad()
     def _is_convex(self) -> bool:
@@ -375,17 +404,26 @@ def extruded(outline: Sequence[tuple[float, float]], half_height: float) -> Mesh
 
     Raises ValueError for an outline of fewer than three corners, and as ``Mesh`` does.
     """
+    return Mesh(*prism_of(outline, -half_height, half_height))
+
+
+def prism_of(
+    outline: Sequence[tuple[float, float]], low: float, high: float
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
+    """Vertices and triangles of the prism over a simple polygon for low <= z <= high [m].
+
+    Raises ValueError for an outline of fewer than three corners."""
     n = len(outline)
     if n < 3:
         raise ValueError(f"an outline of {n} corners: expected 3 or more")
-    ring = np.array([[x, y, z] for z in (-half_height, half_height) for x, y in outline])
+    ring = np.array([[x, y, z] for z in (low, high) for x, y in outline], dtype=np.float64)
     sides = [[i, (i + 1) % n, n + (i + 1) % n, n + i] for i in range(n)]
     faces = [list(range(n))[::-1], list(range(n, 2 * n)), *sides]
     count, index = np.array([len(f) for f in faces]), np.concatenate(faces)
-    return Mesh(ring, triangles_of(ring, count, index))
+    return ring, triangles_of(ring, count, index)
 
 
-def _beside(point: Tensor, start: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
+def beside_segments(point: Tensor, start: Tensor, along: Tensor) -> tuple[Tensor, Tensor]:
     """Square of the distance to segments, and where along them, 0 to 1."""
     away = point[:, None] - start
     share = ((away * along).sum(-1) / (along * along).sum(-1)).clamp(0.0, 1.0)

@@ -4,6 +4,7 @@ Also ``Dielectric``, the medium that half-spaces and slabs are made of.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,6 +14,15 @@ from torch import Tensor, nn
 from rfsg.objects.contract import Contact, Crossing, Shape
 from rfsg.objects.physics import fresnel, media
 from rfsg.objects.physics.lobes import Scattering
+
+ALIKE = 0.5  # cosine below which a slope is of another face than the normal it is compared with
+
+
+@dataclass(frozen=True)
+class Slid(Crossing):
+    """A crossing whose ends have slid along it to where its surface is now, and whose normals are
+    those of where it was found. They turn with the surface (``turned``): left to those who ask a
+    shape about the ends anyway."""
 
 
 class Dielectric(nn.Module):
@@ -220,6 +230,19 @@ def crossing_cosines(
         _cosine(direction, crossing.normal_start),
         _cosine(direction, crossing.normal_end),
     )
+
+
+def turned(
+    normal: Float[Tensor, "*b 3"], gradient: Float[Tensor, "*b 3"], slope: Float[Tensor, "*b"]
+) -> Float[Tensor, "*b 3"]:
+    """Normals turned to where grad f points now; slope = |grad f|.
+
+    Zero vectors stay, and so do normals that are far from it: on an edge f may be another face's.
+    """
+    length = slope[..., None]
+    now = gradient / torch.where(length == 0, 1.0, length)
+    alike = (now.detach() * normal.detach()).sum(-1, keepdim=True) > ALIKE
+    return torch.where(alike, now, normal)
 
 
 def at_boundary(normal: Float[Tensor, "*b 3"]) -> Tensor:

@@ -15,17 +15,18 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 from torch import Tensor, nn
 
 from rfsg.objects.contract import Contact, Crossing, Shape
 from rfsg.objects.physics import transport
 from rfsg.objects.physics.lobes import Scattering, share_amplitude
 from rfsg.objects.surfaces.interface import (
+    Slid,
     at_boundary,
     contact_cosine,
-    crossing_cosines,
     crossing_direction,
+    turned,
 )
 from rfsg.objects.sweeps import swept_heads
 
@@ -60,6 +61,14 @@ class _Samples(NamedTuple):
     f: Tensor
     gradient: Tensor
     fields: Fields
+
+
+class _Ends(NamedTuple):
+    """Where a crossing enters and leaves: whether it does, its normals (zero where not), |grad f|."""
+
+    boundary: Bool[Tensor, "*b 2"]
+    normal: Float[Tensor, "*b 2 3"]
+    slope: Float[Tensor, "*b 2"]
 
 
 class StochasticSurface(nn.Module):
@@ -153,10 +162,20 @@ class StochasticSurface(nn.Module):
             "samples": self.samples,
         }
 
-    def fields(self, shape: Shape, point: Float[Tensor, "*b 3"]) -> Fields:
-        """m, alpha, phi and kappa at points [m], for reports and regularisation."""
-        feature = getattr(shape, "feature", None)
-        return self._network(shape, point, None if feature is None else feature(point))
+    def fields(
+        self,
+        shape: Shape,
+        point: Float[Tensor, "*b 3"],
+        feature: Float[Tensor, "*b h"] | None = None,
+    ) -> Fields:
+        """m, alpha, phi and kappa at points [m], for reports and regularisation.
+
+        feature: what the shape says of the points, where it has been asked already.
+        """
+        ask = getattr(shape, "feature", None)
+        if feature is None and ask is not None:
+            feature = ask(point)
+        return self._network(shape, point, feature)
 
     def reflection(
         self, shape: Shape, contact: Contact, frequency: Float[Tensor, "f"]
@@ -186,8 +205,13 @@ class StochasticSurface(nn.Module):
     def _whole(self, shape: Shape, contact: Contact) -> tuple[Tensor, Tensor]:
         """R of all that is reflected, and alpha there."""
         at = self._sample(shape, contact.point)
-        a = self._interaction(at, at.f.clamp(min=0.0), contact_cosine(contact))
-        return (-a).exp(), at.fields.alpha
+        m, alpha, phi, _ = at.fields
+        slope = transport.gradient_norm(at.gradient)
+        mix = transport.sigma_mix(alpha, contact_cosine(contact))
+        s = self.sharpness.to(at.f)
+        sigma = transport.sigma_outside(self.law, at.f.clamp(min=0.0), slope, m, mix, s)
+        a = sigma * transport.phasor(phi)
+        return (-self.interaction_length.to(at.f) * a).exp(), alpha
 
     def transmission(
         self, shape: Shape, crossing: Crossing, frequency: Float[Tensor, "f"]
@@ -198,10 +222,14 @@ class StochasticSurface(nn.Module):
         (the vertex moves with the surface) also its derivative. The same bits from end to start.
         """
         at = self._sample(shape, self._points(crossing))
-        at = at._replace(f=_pin(at.f, crossing))
-        through = (-self._integral(at, crossing)).exp()
+        ends = _ends(crossing, at.gradient[..., :: self.samples, :])
+        pinned = torch.zeros_like(at.f, dtype=torch.bool)
+        pinned[..., :: self.samples] = ends.boundary
+        at = at._replace(f=at.f.masked_fill(pinned, 0.0))
+        direction, sharpness = crossing_direction(crossing), self.sharpness.to(at.f)
+        through = (-self._integral(at, crossing, direction, sharpness)).exp()
         if self.interface == "conserving":
-            through = through * self._passed(at, crossing)
+            through = through * self._passed(at, ends, direction, sharpness)
         return _expand(through, frequency)
 
     def excess_delay(
@@ -218,8 +246,9 @@ class StochasticSurface(nn.Module):
         start, end = crossing.start[..., None, :], crossing.end[..., None, :]
         return start * weight.flip(0) + end * weight
 
-    def _integral(self, at: _Samples, crossing: Crossing) -> Tensor:
-        direction = crossing_direction(crossing)
+    def _integral(
+        self, at: _Samples, crossing: Crossing, direction: Tensor, sharpness: Tensor
+    ) -> Tensor:
         length = ((crossing.end - crossing.start) * direction).sum(-1)
         return transport.INTEGRALS[self.integral](
             self.law,
@@ -228,30 +257,22 @@ class StochasticSurface(nn.Module):
             at.fields.m,
             at.fields.alpha,
             at.fields.phi,
-            self.sharpness.to(at.f),
+            sharpness,
             direction,
             length / self.samples,
             at.fields.kappa,
         )
 
-    def _interaction(self, at: _Samples, f: Tensor, cosine: Tensor) -> Tensor:
-        """a_out * interaction_length, complex."""
-        m, alpha, phi, _ = at.fields
-        slope = transport.gradient_norm(at.gradient)
-        mix = transport.sigma_mix(alpha, cosine)
-        s = self.sharpness.to(f)
-        sigma = transport.sigma_outside(self.law, f, slope, m, mix, s)
-        return sigma * self.interaction_length.to(f) * transport.phasor(phi)
-
-    def _passed(self, at: _Samples, crossing: Crossing) -> Tensor:
+    def _passed(self, at: _Samples, ends: _Ends, direction: Tensor, sharpness: Tensor) -> Tensor:
         """Product of sqrt(1 - |R|^2) over the ends that lie on the boundary."""
-        normals = (crossing.normal_start, crossing.normal_end)
-        amplitude = []
-        for i, cosine, normal in zip((0, -1), crossing_cosines(crossing), normals, strict=True):
-            end = _at(at, i)
-            passed = -torch.expm1(-2 * self._interaction(end, torch.zeros_like(end.f), cosine).real)
-            amplitude.append(torch.where(at_boundary(normal), _amplitude(passed), 1.0))
-        return amplitude[0] * amplitude[1]
+        m, alpha, phi, _ = at.fields.each(lambda field: field[..., :: self.samples])
+        cosine = (direction[..., None, :] * ends.normal).sum(-1).clamp(-1.0, 1.0)
+        mix = transport.sigma_mix(alpha, cosine)
+        sigma = transport.sigma_at_face(self.law, ends.slope, m, mix, sharpness)
+        depth = sigma * self.interaction_length.to(sigma) * transport.in_phase(phi)
+        amplitude = _amplitude(-torch.expm1(-2 * depth))
+        first, last = amplitude.masked_fill(~ends.boundary, 1.0).unbind(-1)
+        return first * last
 
     def _sample(self, shape: Shape, point: Tensor) -> _Samples:
         """f, its gradient and the fields at points; in chunks where no gradient is asked for."""
@@ -312,10 +333,8 @@ def _weights(layers: nn.ModuleList, inputs: int) -> Iterator[Tensor]:
 def _normalised(shape: Shape, point: Tensor) -> Tensor:
     """Points in half diagonals of the object about its middle; metres if it has no bounds."""
     low, high = shape.bounds().to(point)
-    middle, half = 0.5 * (low + high), 0.5 * (high - low).norm()
-    bounded = torch.isfinite(low).all() & torch.isfinite(high).all() & (half > 0)
-    middle = torch.where(bounded, middle, torch.zeros_like(middle))
-    return (point - middle) / torch.where(bounded, half, torch.ones_like(half))
+    half = 0.5 * (high - low).norm()
+    return (point - 0.5 * (low + high)) / half if 0 < float(half.detach()) < math.inf else point
 
 
 def _whole(parts: list[_Samples]) -> _Samples:
@@ -329,15 +348,13 @@ def _whole(parts: list[_Samples]) -> _Samples:
     )
 
 
-def _pin(f: Tensor, crossing: Crossing) -> Tensor:
-    first = torch.where(at_boundary(crossing.normal_start), 0.0, f[..., 0])
-    last = torch.where(at_boundary(crossing.normal_end), 0.0, f[..., -1])
-    return torch.cat([first[..., None], f[..., 1:-1], last[..., None]], -1)
-
-
-def _at(samples: _Samples, i: int) -> _Samples:
-    fields = samples.fields.each(lambda field: field[..., i])
-    return _Samples(samples.f[..., i], samples.gradient[..., i, :], fields)
+def _ends(crossing: Crossing, gradient: Float[Tensor, "*b 2 3"]) -> _Ends:
+    """Where a crossing enters and leaves; gradient: of f there."""
+    normal = torch.stack([crossing.normal_start, crossing.normal_end], -2)
+    boundary, slope = at_boundary(normal), transport.gradient_norm(gradient)
+    if isinstance(crossing, Slid):
+        normal = turned(normal, gradient, slope)
+    return _Ends(boundary, normal, slope)
 
 
 def _amplitude(power: Tensor) -> Tensor:

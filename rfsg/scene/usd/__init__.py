@@ -10,13 +10,29 @@ Where USD leaves room: visibility does not make a thing vanish for waves (``acti
 purposes guide and proxy do; a material bound on an ancestor holds for all below it; the numbers of
 a neural object are metres of the layer that brought its weights in.
 
-``reading`` walks a stage and ``writing`` makes one; ``objects`` does both for one asset. What each
+``reading`` walks a stage and ``writing`` makes one; ``objects`` reads one asset, ``packaging`` writes
+it, and ``validation`` says what is amiss with either. ``edits`` writes what was changed as a layer
+over a scene's source, and ``live`` follows a stage that others edit. What each
 kind of thing is in USD, read and written, is in ``shapes``, ``materials``, ``radios`` and
 ``placements``. Below them: ``attributes``, ``composition``, ``layers``, ``faults``.
 """
 
-from rfsg.scene.usd.objects import AssetRecord, read_asset, write_asset
-from rfsg.scene.usd.reading import check, read
+from rfsg.scene.usd.edits import save_edits, with_variant
+from rfsg.scene.usd.live import LiveScene
+from rfsg.scene.usd.objects import AssetRecord, read_asset
+from rfsg.scene.usd.packaging import write_asset
+from rfsg.scene.usd.reading import read
+from rfsg.scene.usd.validation import check
 from rfsg.scene.usd.writing import write
 
-__all__ = ["AssetRecord", "check", "read", "read_asset", "write", "write_asset"]
+__all__ = [
+    "AssetRecord",
+    "LiveScene",
+    "check",
+    "read",
+    "read_asset",
+    "save_edits",
+    "with_variant",
+    "write",
+    "write_asset",
+]

@@ -11,6 +11,10 @@ from rfsg.scene.materials import Material
 from rfsg.scene.scene import SceneError
 from rfsg.scene.usd.attributes import MATERIAL_API, author, values_of
 from rfsg.scene.usd.composition import spec
+from rfsg.scene.usd.kept import Kept
+from rfsg.scene.usd.meshes import is_sheet
+
+FILLING = ("solid", "stochastic")  # models that say what an object does inside
 
 
 @dataclass
@@ -19,6 +23,7 @@ class Materials:
 
     time: Usd.TimeCode
     device: torch.device
+    kept: Kept
     surfaces: dict[tuple[str, Material], Surface] = field(default_factory=dict)
 
     def said(self, prim: Usd.Prim) -> tuple[str, Material] | None:
@@ -44,6 +49,11 @@ class Materials:
         self, prim: Usd.Prim, where: str, material: Material, thickness: float | None = None
     ) -> Surface:
         """One surface for each material prim and thickness: what a fit learns of it, all share."""
+        if material.model in FILLING and is_sheet(prim):
+            raise SceneError(
+                [f"{prim.GetPath()}: a sheet has no inside for model {material.model} to fill; "
+                 "expected conductor, halfspace or slab"]
+            )  # fmt: skip
         if material.model == "slab" and material.thickness is None:
             if thickness is None:
                 raise SceneError([f"{prim.GetPath()}: slab needs rfsg:material:thickness here"])
@@ -51,7 +61,9 @@ class Materials:
         key = (where, material)
         if key not in self.surfaces:
             try:
-                self.surfaces[key] = material.surface().to(self.device)
+                make = material.surface
+                surface = self.kept.of(("surface", *key), make)
+                self.surfaces[key] = surface.to(self.device)
             except (ValueError, TypeError) as error:
                 raise SceneError([f"{where}: {error}"]) from error
         return self.surfaces[key]

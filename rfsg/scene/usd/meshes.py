@@ -1,4 +1,9 @@
-"""Closed meshes in USD: polygons become the triangles of a ``Mesh``, and back."""
+"""Meshes in USD: polygons become the triangles of a ``Mesh``, and back.
+
+A mesh is a closed solid, unless its customData say that it is a sheet: ``rfsg = { bool sheet = true }``.
+"""
+
+import hashlib
 
 import numpy as np
 import torch
@@ -7,14 +12,17 @@ from pxr import Usd, UsdGeom, UsdShade, Vt
 
 from rfsg.objects.shapes.mesh import Mesh
 from rfsg.objects.shapes.polygons import triangles_of
+from rfsg.objects.shapes.sheet import Sheet
 from rfsg.objects.shapes.topology import MAX_TRIANGLES
 from rfsg.scene.fields import MESH_POINTS
 from rfsg.scene.scene import SceneError
 from rfsg.scene.usd.attributes import author, values_of
+from rfsg.scene.usd.kept import Kept
 
 
-def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray) -> Mesh:
-    """The shape of a mesh prim, ``scales`` [3] absorbed. Raises SceneError for what is no solid."""
+def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray, shared: str, kept: Kept) -> Mesh:
+    """The shape of a mesh prim, ``scales`` [3] absorbed; the same for equal arrays under one key
+    ``shared``. Raises SceneError for what is no solid."""
     where = str(prim.GetPath())
     point, count, index = (_array(prim, name, time) for name in NAMES)
     if faults := _amiss(point, count, index):
@@ -24,13 +32,32 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray) -> Mesh:
     # what another program moved since is where that program put it
     if exact is not None and np.array_equal(exact.astype(np.float32), point.astype(np.float32)):
         point = exact
+    sheet = is_sheet(prim)
+    key = ("mesh", shared, str(sheet), *(a.tobytes() for a in (scales, point, count, index)))
     try:
-        return Mesh(point * scales, triangles_of(point, count, index))
+        return kept.of(
+            digest_of(key),
+            lambda: Mesh(point * scales, triangles_of(point, count, index), sheet=sheet),
+        )
     except ValueError as error:
         raise SceneError(
             [f"{where}: no solid for waves: {error}. A shape that is not closed can be repaired and "
-             "learned with `rfsg learn-shape`"]
+             "learned with `rfsg learn-shape`, or be a sheet: customData rfsg:sheet = true"]
         ) from error  # fmt: skip
+
+
+SHEET = {"rfsg": {"sheet": True}}  # customData of a mesh without an inside
+
+
+def is_sheet(prim: Usd.Prim) -> bool:
+    """Whether a mesh prim says that it is a surface without an inside."""
+    return prim.GetCustomDataByKey("rfsg:sheet") is True
+
+
+def digest_of(key: tuple[str | bytes, ...]) -> str:
+    """A short key in place of one that holds arrays."""
+    parts = (part.encode() if isinstance(part, str) else part for part in key)
+    return hashlib.sha256(b"".join(len(p).to_bytes(8, "little") + p for p in parts)).hexdigest()
 
 
 NAMES = ("points", "faceVertexCounts", "faceVertexIndices")
@@ -88,7 +115,11 @@ def author_mesh(prim: Usd.Prim, shape: Mesh) -> None:
     """Points in single precision, as USD meshes hold them, and beside them as they are if that is
     not the same."""
     point = shape.vertices.detach().cpu().to(torch.float64).numpy()
-    author_triangles(UsdGeom.Mesh(prim), point, shape.triangles.cpu().numpy())
+    triangles = shape.triangles.cpu().numpy()
+    if isinstance(shape, Sheet):
+        triangles = triangles[: len(triangles) // 2]  # both sides of each are its own business
+        prim.SetCustomDataByKey("rfsg:sheet", True)
+    author_triangles(UsdGeom.Mesh(prim), point, triangles)
     if not np.array_equal(point.astype(np.float32).astype(np.float64), point):
         author(prim, {MESH_POINTS: Vt.Vec3dArray.FromNumpy(point)})
 

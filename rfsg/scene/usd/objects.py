@@ -1,34 +1,24 @@
-"""Objects in asset files: one trained object and its record, read, written, and found in a scene."""
+"""Objects in asset files: one trained object and its record, read, and found in a scene."""
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, UsdMedia
 
 from rfsg.objects.body import Body
-from rfsg.objects.contract import Shape
 from rfsg.scene import files
-from rfsg.scene.fields import NEURAL
+from rfsg.scene.fields import BAND, NEURAL
 from rfsg.scene.scene import SceneError
-from rfsg.scene.usd.attributes import NEURAL_API, author
+from rfsg.scene.usd.attributes import values_of
 from rfsg.scene.usd.composition import arcs, layer_of, metre_of, up_of
 from rfsg.scene.usd.faults import quiet
-from rfsg.scene.usd.layers import asset_bytes, asset_path, new_stage, open_stage
-from rfsg.scene.usd.meshes import author_triangles, vectors
-from rfsg.scene.weights import (
-    FORMAT_VERSION,
-    MAX_WEIGHTS_BYTES,
-    digest,
-    pack,
-    refuse_overwrite,
-    unpack,
-    write_beside,
-)
+from rfsg.scene.usd.layers import asset_bytes, asset_path, gathered, open_stage
+from rfsg.scene.weights import MAX_WEIGHTS_BYTES, digest, unpack
 
 WEIGHTS = NEURAL[0].name
 
@@ -37,15 +27,20 @@ WEIGHTS = NEURAL[0].name
 class AssetRecord:
     """What an asset's USD file says, and the object its weights hold.
 
-    referable: a scene in metres, z up, may reference the file as it is. portable: the two files
-    are the whole asset, side by side."""
+    prim: path of the object in the file. picture: the resolved path of its thumbnail, if there is
+    one that may be read. extent: of the surface that other programs show [m], lowest and highest
+    corner. referable: a scene in metres, z up, may reference the file as it is. parts: all files of
+    the asset, when they lie in its own folder; none otherwise."""
 
+    prim: str
     body: Body
     provenance: dict[str, Any]
     weights: str
     sha256: str
+    picture: str | None
+    extent: np.ndarray | None
     referable: bool
-    portable: bool
+    parts: tuple[Path, ...]
 
 
 def read_asset(path: Path) -> AssetRecord:
@@ -64,16 +59,56 @@ def read_asset(path: Path) -> AssetRecord:
         resolved, given = asset_path(prim, WEIGHTS, roots, where)
         data = weights_bytes(prim, resolved, given, where)
         story = prim.GetAttribute("rfsg:neural:provenance").Get() or "{}"
+        band = band_of(where, values_of(prim, Usd.TimeCode.EarliestTime(), *BAND))
+        picture, extent, parts = _picture(prim, roots), _extent(prim), _parts(path, roots)
         layer = stage.GetRootLayer()
         referable = prim == root and (metre_of(layer), up_of(layer)) == (1.0, "Z")
     try:
         provenance = json.loads(story)
     except (ValueError, RecursionError) as error:
         raise SceneError([f"{where}: rfsg:neural:provenance is not JSON: {error}"]) from error
-    beside = Path(resolved).parent == Path(os.path.realpath(path)).parent
-    portable = beside and not any(layer.GetCompositionAssetDependencies())
     body = unpack(data, f"{path}: {given}", resolved)
-    return AssetRecord(body, provenance, resolved, digest(data), referable, portable)
+    body.band = band
+    sha256 = digest(data)
+    return AssetRecord(where, body, provenance, resolved, sha256, picture, extent, referable, parts)
+
+
+def band_of(where: str, said: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Lowest and highest frequency [Hz] that an object was learned at, None where nothing is said.
+
+    Raises SceneError for half a band, or one upside down."""
+    low, high = (said[item.name] for item in BAND)
+    if low is None and high is None:
+        return None
+    if low is None or high is None or high < low:
+        names = " and ".join(item.name for item in BAND)
+        raise SceneError([f"{where}: {names} are {low} and {high}; expected both, the lower first"])
+    return low, high
+
+
+def _picture(prim: Usd.Prim, roots: tuple[Path, ...]) -> str | None:
+    shown = UsdMedia.AssetPreviewsAPI(prim).GetDefaultThumbnails()
+    found = str(shown.defaultImage.resolvedPath) if shown else ""
+    return found if found and not files.outside(found, roots) else None
+
+
+def _extent(prim: Usd.Prim) -> np.ndarray | None:
+    """What the surface drawn of an object says that it spans [2 3], None where it says nothing."""
+    for child in prim.GetChildren():
+        drawn = child.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(child).ComputePurpose() == "default"
+        extent = np.array(UsdGeom.Mesh(child).GetExtentAttr().Get() or ()) if drawn else None
+        if extent is not None and extent.shape == (2, 3) and np.isfinite(extent).all():
+            return extent.astype(np.float64)
+    return None
+
+
+def _parts(path: Path, roots: tuple[Path, ...]) -> tuple[Path, ...]:
+    """The files that an asset consists of, the given one first; none when one of them is missing or
+    lies outside its folder."""
+    found, refused = gathered(path, roots)
+    first = Path(os.path.realpath(path))
+    whole = not refused and all(f.is_relative_to(first.parent) for f in found)
+    return (first, *sorted(found - {first})) if whole else ()
 
 
 def weights_bytes(prim: Usd.Prim, resolved: str, given: str, where: str) -> bytes:
@@ -115,71 +150,3 @@ def _home(prim: Usd.Prim) -> tuple[Sdf.Layer, Sdf.Path]:
         if any(layer.GetAttributeAtPath(at) for layer in node.layerStack.layers):
             home = (layer_of(node) or home[0], node.path)
     return home
-
-
-def write_asset(
-    usda: Path,
-    body: Body,
-    name: str,
-    mesh: Any | None,
-    provenance: Mapping[str, Any],
-    color: Sequence[float],
-    overwrite: bool,
-) -> None:
-    """Write an asset's two files; see ``rfsg.scene.assets.save_asset``."""
-    weights = usda.with_suffix(".safetensors")
-    refuse_overwrite([usda, weights], overwrite)
-    data = pack(body)
-    layer = _asset_layer(name, weights.name, digest(data), body.shape, mesh, provenance, color)
-    # weights first: an interruption in between leaves a hash that does not match, no mix
-    write_beside(weights, data, overwrite)
-    write_beside(usda, layer.encode(), overwrite)
-
-
-def _asset_layer(
-    name: str,
-    weights: str,
-    sha256: str,
-    shape: Shape,
-    mesh: Any | None,
-    provenance: Mapping[str, Any],
-    color: Sequence[float],
-) -> str:
-    name = Tf.MakeValidIdentifier(name)
-    try:
-        story = json.dumps(provenance, sort_keys=True, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise SceneError([f"/{name}: the provenance is not JSON: {error}"]) from error
-    stage = new_stage()
-    root = UsdGeom.Xform.Define(stage, f"/{name}").GetPrim()
-    stage.SetDefaultPrim(root)
-    Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-    low, high = shape.bounds().detach().cpu().tolist()
-    values = (
-        Sdf.AssetPath(f"./{weights}"),
-        FORMAT_VERSION,
-        sha256,
-        Gf.Vec3f(*low),
-        Gf.Vec3f(*high),
-        float(shape.lipschitz),
-        story,
-    )
-    author(root, dict(zip(NEURAL, values, strict=True)), NEURAL_API)
-    if mesh is not None:
-        _define_mesh(stage, f"/{name}/Surface", mesh, color)
-    return stage.GetRootLayer().ExportToString()
-
-
-def _define_mesh(stage: Usd.Stage, path: str, mesh: Any, color: Sequence[float]) -> None:
-    vertices, faces, normals = (np.asarray(part) for part in mesh)
-    finite = np.isfinite(vertices).all() and np.isfinite(normals).all()
-    inside = len(faces) > 0 and faces.min() >= 0 and faces.max() < len(vertices)
-    if not (finite and inside and normals.shape == vertices.shape):
-        raise SceneError([f"{path}: the mesh has bad indices, or normals or numbers amiss"])
-    prim = UsdGeom.Mesh.Define(stage, path)
-    author_triangles(prim, vertices, faces)
-    # faceVarying: Blender's importer takes custom normals from nothing else
-    prim.CreateNormalsAttr(vectors(normals[faces.ravel()]))
-    prim.SetNormalsInterpolation(UsdGeom.Tokens.faceVarying)
-    prim.CreateExtentAttr(vectors(np.stack([vertices.min(0), vertices.max(0)])))
-    prim.CreateDisplayColorAttr([Gf.Vec3f(*(float(c) for c in color))])

@@ -16,6 +16,7 @@ from rfsg.scene.radios import Radio
 from rfsg.scene.scene import SceneError
 from rfsg.scene.usd.attributes import RADIO_API, as_numpy, author, values_of
 from rfsg.scene.usd.faults import attempt
+from rfsg.scene.usd.kept import Kept
 from rfsg.scene.usd.layers import asset_bytes, asset_path
 from rfsg.scene.usd.placements import Places
 
@@ -31,6 +32,7 @@ class Radios:
     roots: Sequence[Path]
     device: torch.device
     warnings: list[str]  # the scene's, which those of radios join
+    kept: Kept
     found: dict[str, list[Radio]] = field(default_factory=lambda: {"tx": [], "rx": []})
     patterns: dict[str, Pattern] = field(default_factory=dict)  # by resolved path
 
@@ -53,19 +55,19 @@ class Radios:
                 f"{prim.GetPath()}: the pattern's field is measured, but rfsg:radio:polarization is "
                 "none: where no radio is polarised only its magnitude counts; V takes it as it is"
             )
-        self.found[said["rfsg:radio:role"]].append(
-            Radio(
-                str(prim.GetPath()),
-                pose.translation.to(self.device),
-                pose.rotation.to(self.device),
-                velocity.to(self.device),
-                said["rfsg:radio:powerDbm"],
-                said["rfsg:radio:frequencyHz"],
-                pattern or said["rfsg:radio:pattern"],
-                said["rfsg:radio:polarization"],
-                array,
-            )
+        radio = Radio(
+            str(prim.GetPath()),
+            pose.translation.to(self.device),
+            pose.rotation.to(self.device),
+            velocity.to(self.device),
+            said["rfsg:radio:powerDbm"],
+            said["rfsg:radio:frequencyHz"],
+            pattern or said["rfsg:radio:pattern"],
+            said["rfsg:radio:polarization"],
+            array,
         )
+        role = said["rfsg:radio:role"]
+        self.found[role].append(self.kept.same((role, radio.path), radio))
 
     def _pattern(self, prim: Usd.Prim) -> Pattern | None:
         """The measured pattern of a radio, read once for all radios with the same file."""
@@ -75,8 +77,13 @@ class Radios:
             return None
         resolved, given = asset_path(prim, PATTERN_FILE, self.roots, where)
         if resolved not in self.patterns:
-            data = asset_bytes(resolved, f"{where}: patternFile {given!r}", MAX_PATTERN_BYTES)
-            pattern = parse(data, f"{where}: {given}", resolved)
+            what = f"{where}: patternFile {given!r}"
+
+            def parsed() -> Pattern:
+                data = asset_bytes(resolved, what, MAX_PATTERN_BYTES)
+                return parse(data, f"{where}: {given}", resolved)
+
+            pattern = self.kept.of(("pattern", resolved, self.kept.stamp(resolved)), parsed)
             self.patterns[resolved] = pattern
             self.warnings += [f"{where}: {warning}" for warning in pattern.warnings()]
         return self.patterns[resolved]

@@ -21,7 +21,8 @@ from rfsg.scene.usd.composition import is_prim_path
 from rfsg.scene.usd.faults import quiet
 from rfsg.scene.usd.layers import new_stage
 from rfsg.scene.usd.materials import define_material
-from rfsg.scene.usd.objects import AssetRecord, read_asset, write_asset
+from rfsg.scene.usd.objects import AssetRecord, read_asset
+from rfsg.scene.usd.packaging import write_asset
 from rfsg.scene.usd.radios import author_radio
 from rfsg.scene.usd.reading import Source
 from rfsg.scene.usd.shapes import PRIM_TYPES, author_shape
@@ -107,32 +108,38 @@ class _Writer:
                 self.records[node.asset] = read_asset(Path(node.asset))
             record = self.records[node.asset]
             own = same_bits(node.body.surface, record.body.surface)
+            own = own and node.body.band == record.body.band
             same = same_bits(node.body.shape, record.body.shape) and (own or material is not None)
             file = Path(node.asset).absolute()
             here = not files.outside(str(file), [files.default_root(self.path)])
-            if same and record.referable and (here or record.portable):
-                return file if here else self._copy(file, Path(record.weights)), own
+            if same and record.referable and (here or record.parts):
+                return file if here else self._copy(record.parts), own
         if id(node.body) not in self.assets:
             file = self._beside(node.path.split("/")[-1])
-            write_asset(file, node.body, file.stem, None, {}, (), self.overwrite)
+            write_asset(file, node.body, name=file.stem, overwrite=self.overwrite)
             self.assets[id(node.body)] = file
         return self.assets[id(node.body)], True
 
-    def _copy(self, asset: Path, weights: Path) -> Path:
-        """A copy beside the scene, which could not read the asset where it lies."""
+    def _copy(self, parts: Sequence[Path]) -> Path:
+        """A copy beside the scene, which could not read the asset where it lies; of two with one
+        name, the second in a folder of its own, for its files name each other."""
+        asset = parts[0]
         if asset not in self.assets:
             file = self._beside(asset.stem)
-            copies = {file: asset, file.with_name(weights.name): weights}
+            home = file.parent if file.stem == asset.stem else file.with_suffix("")
+            copies = {home / part.relative_to(asset.parent): part for part in parts}
             refuse_overwrite(list(copies), self.overwrite)
             for copy, original in copies.items():
+                copy.parent.mkdir(parents=True, exist_ok=True)
                 write_beside(copy, original.read_bytes(), self.overwrite)
-            self.assets[asset] = file
+            self.assets[asset] = home / asset.name
         return self.assets[asset]
 
     def _beside(self, name: str) -> Path:
         folder = self.path.with_name(f"{self.path.stem}_assets")
         folder.mkdir(exist_ok=True)
-        taken = {file.stem for file in self.assets.values()}
+        tops = (file.relative_to(folder).parts[0] for file in self.assets.values())
+        taken = {Path(t).stem if t.endswith(files.LAYER_SUFFIXES) else t for t in tops}
         return folder / f"{_unused(name, taken)}.usda"
 
     def _pattern_file(self, pattern: Pattern) -> Sdf.AssetPath:

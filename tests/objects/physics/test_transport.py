@@ -182,6 +182,19 @@ def test_inside_and_outside_agree_on_the_boundary_and_mirror():
     assert torch.equal(out, inside)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_on_the_face_inside_and_outside_are_one(name):
+    law, one = LAWS[name], torch.ones(5, dtype=F64)
+    s = torch.tensor(12.0, dtype=F64, requires_grad=True)
+    m, mix = torch.linspace(0, 3, 5, dtype=F64), torch.linspace(0, 1, 5, dtype=F64)
+    face = transport.sigma_at_face(law, one, m, mix, s)
+    for side in (transport.sigma_inside, transport.sigma_outside):
+        own = side(law, torch.zeros_like(one), one, m, mix, s)
+        torch.testing.assert_close(face, own, rtol=1e-15, atol=0)
+        slopes = [torch.autograd.grad(x.sum(), s, retain_graph=True) for x in (face, own)]
+        torch.testing.assert_close(*slopes, rtol=1e-15, atol=0)
+
+
 @pytest.mark.parametrize("integral", sorted(transport.INTEGRALS))
 @pytest.mark.parametrize("name", NAMES)
 def test_gradcheck(integral, name):

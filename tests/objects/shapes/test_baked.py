@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections import OrderedDict
 
 import pytest
 import torch
@@ -10,8 +11,12 @@ from safetensors.torch import load, save
 
 from rfsg.objects.shapes import kept
 from rfsg.objects.shapes.baked import bake, key_of
+from rfsg.objects.shapes.band import LEAST_TURN, WAYS
+from rfsg.objects.shapes.blocks import BEND_SAFETY, ROUNDING
 from rfsg.objects.shapes.neural import NeuralShape
+from rfsg.objects.shapes.offs import TOLERANCE
 from rfsg.objects.shapes.refined import refined
+from rfsg.objects.shapes.shell import MOVED, SAFETY
 from tests.tracer.shapes import Field, ball, two_walls
 
 STEP = 0.02
@@ -31,7 +36,7 @@ def inside(shape, count, seed=0):
 
 @pytest.fixture(autouse=True)
 def nothing_kept(monkeypatch):
-    monkeypatch.setattr(kept, "_MEMORY", {})
+    monkeypatch.setattr(kept, "_MEMORY", OrderedDict())
 
 
 @pytest.mark.parametrize("shape", [small(), Field(ball(0.3), [0.4] * 3, lipschitz=1.0)])
@@ -102,7 +107,7 @@ def test_a_file_comes_back_as_it_was(tmp_path, monkeypatch):
     point = inside(shape, 1000)
     assert all(torch.equal(a, b) for a, b in zip(first.look(point), again.look(point), strict=True))
     assert torch.equal(first.zero.triangles, again.zero.triangles)
-    assert (first.level, first.margin, first.slope) == (again.level, again.margin, again.slope)
+    assert (first.margin, first.slope, first.offs) == (again.margin, again.slope, again.offs)
 
 
 def test_a_folder_that_may_only_be_read_is_no_fault(tmp_path, monkeypatch):
@@ -148,7 +153,26 @@ def _endless(tensors, head):
     head["slope"] = -1.0
 
 
-SPOILED = [_beyond, _no_corner, _not_a_number, _another, _fewer, _wide, _short, _endless]
+def _exact(tensors, head):
+    head["offs"]["mesh"]["usual"] = -1.0
+
+
+def _wayless(tensors, head):
+    del head["offs"]["newton"]
+
+
+SPOILED = [
+    _beyond,
+    _no_corner,
+    _not_a_number,
+    _another,
+    _fewer,
+    _wide,
+    _short,
+    _endless,
+    _exact,
+    _wayless,
+]
 
 
 @pytest.mark.parametrize("spoil", SPOILED, ids=[f.__name__ for f in SPOILED])
@@ -186,15 +210,93 @@ def test_a_file_too_large_is_not_read(tmp_path, monkeypatch):
         kept.baked(shape, tmp_path, STEP)
 
 
+def crease(p):
+    x, y, z = p.unbind(-1)
+    return torch.minimum(p.norm(dim=-1) - 0.2, (x - 0.1).abs() + 0.5 * y * z / 0.3 - 0.02)
+
+
+FIELDS = {"ball": ball(0.3), "crease": crease}
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_a_shell_holds_all_and_keeps_close(kind):
+    """Whatever is within f = 0 is within the shell, at creases too; on a sphere it is as near as the
+    bend of f over a cell leaves it: an eighth of it along each axis, with the margins taken."""
+    shape = Field(FIELDS[kind], [0.4] * 3, lipschitz=2.0)
+    made = bake(shape, 0.01)
+    shell = trimesh.Trimesh(made.shell.vertices.numpy(), made.shell.triangles.numpy())
+    assert shell.is_watertight
+    some = torch.randint(len(made.zero.vertices), (6000,))
+    point = made.zero.vertices[some] + 0.002 * torch.randn(len(some), 3)
+    within = point[(shape.sdf(point) < 0) & (point.abs().amax(-1) < 0.39)]
+    assert len(within) > 300 and bool(shell.contains(within.numpy()).all())
+    if kind == "ball":
+        # second differences add up to 2 h^2 / R, mixed ones to half of h^2 / R
+        bend, twist = 2.0 * 0.01**2 / 0.28, 0.5 * 0.01**2 / 0.28
+        allowed = SAFETY * BEND_SAFETY * bend / 8.0 + twist + made.slope * 2 * MOVED * 0.01
+        assert float(shape.sdf(made.shell.vertices).max()) < allowed + bend / 8.0
+
+
+@pytest.mark.parametrize("kind", FIELDS)
+def test_slopes_turn_by_no_more_than_is_said(kind):
+    """Along lines of up to a cell's length from the surface, whichever way they go."""
+    shape = Field(FIELDS[kind], [0.4] * 3, lipschitz=2.0)
+    made = bake(shape, 0.01)
+    generator = torch.Generator().manual_seed(8)
+    some = torch.randint(len(made.zero.vertices), (20_000,), generator=generator)
+    start = made.zero.vertices[some].clamp(-0.38, 0.38)
+    direction = torch.nn.functional.normalize(torch.randn(20_000, 3, generator=generator), dim=-1)
+    length = torch.rand(20_000, generator=generator)
+    ends = [start, start + made.step * length[:, None] * direction]
+    slopes = [(shape.value_and_gradient(p)[1] * direction).sum(-1) for p in ends]
+    allowed = made.look_about(start)[2] * length.clamp(min=LEAST_TURN)
+    assert bool(((slopes[1] - slopes[0]).abs() <= allowed).all())
+
+
+def test_offs_hold_on_a_sphere():
+    """A mesh errs by its chords' sagitta, values by the bend of f; both are found, and nothing is lost."""
+    radius, step = 0.3, 0.02
+    offs = bake(Field(ball(radius), [0.4] * 3, lipschitz=1.0), step).offs
+    assert set(offs) == set(WAYS)
+    # a triangle of sides no longer than sqrt(3) h lies no deeper than that of a circle through its corners
+    assert 0.0 < offs["mesh"].usual <= offs["mesh"].most <= SAFETY * step**2 / (2 * radius) + 1e-5
+    assert offs["newton"].most <= offs["mesh"].most
+    # each axis' second derivative is at most 1 / R, and all three add up to 2 / R
+    assert 0.0 < offs["grid"].usual <= step**2 / 8.0 * 2.0 / (radius - step)
+    assert offs["certain"].most <= SAFETY * (TOLERANCE + ROUNDING) * (1.0 + 1e-3)
+    assert all(off.lost < 1e-3 for off in offs.values())
+
+
+def test_offs_are_known_of_what_is_kept(tmp_path, monkeypatch):
+    """In memory, or in a file of which only the head is read; of nothing else."""
+    monkeypatch.setattr("rfsg.objects.shapes.baked.default_step", lambda shape: STEP)
+    shape = small()
+    shape.folder = str(tmp_path)
+    assert kept.offs_of(shape) is None
+    made = kept.baked(shape, tmp_path, STEP)
+    assert kept.offs_of(shape) == made.offs
+    kept._MEMORY.clear()
+    monkeypatch.setattr(kept, "load", lambda _: pytest.fail("read as a whole"))
+    assert kept.offs_of(shape) == made.offs
+    shape.to_value.bias.add_(1e-3)
+    assert kept.offs_of(shape) is None
+
+
+def test_memory_forgets_what_was_asked_longest_ago(monkeypatch):
+    monkeypatch.setattr(kept, "MOST_KEPT", 2)
+    monkeypatch.setattr(kept, "bake", lambda shape, step: bake(shape, 0.05))
+    one, two, three = (small(seed) for seed in (1, 2, 3))
+    first = kept.baked(one, step=0.05)
+    kept.baked(two, step=0.05)
+    assert kept.baked(one, step=0.05) is first
+    kept.baked(three, step=0.05)
+    assert list(kept._MEMORY) == [id(one), id(three)]
+
+
 @pytest.mark.parametrize("kind", ["ball", "crease"])
 def test_f_keeps_its_sign_as_far_ahead_as_is_said(kind):
     """Sampled densely all along: in a smooth field, and across creases and saddles of one."""
-
-    def crease(p):
-        x, y, z = p.unbind(-1)
-        return torch.minimum(p.norm(dim=-1) - 0.2, (x - 0.1).abs() + 0.5 * y * z / 0.3 - 0.02)
-
-    shape = Field(ball(0.3) if kind == "ball" else crease, [0.4] * 3, lipschitz=2.0)
+    shape = Field(FIELDS[kind], [0.4] * 3, lipschitz=2.0)
     made = bake(shape, 0.01)
     generator = torch.Generator().manual_seed(0)
     some = torch.randint(len(made.zero.vertices), (20_000,), generator=generator)
