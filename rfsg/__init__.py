@@ -4,7 +4,7 @@
 
     scene = rfsg.Scene.from_usd("lab.usda")
     result = rfsg.simulate(scene, frequency=2.44e9)
-    moved = rfsg.simulate(scene.moved("/World/Cabinet", (1.2, 0, 0)), frequency=2.44e9)
+    moved = result.after(scene.moved("/World/Cabinet", (1.2, 0, 0)))
 
 Conventions, everywhere:
 

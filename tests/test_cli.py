@@ -171,7 +171,8 @@ def test_simulate_writes_everything(faked, tmp_path, capsys):
     report = json.loads((out / "report.json").read_text())
     assert report["move"] == ["/World/Wall=1,0,-0.5"] and report["seed"] == 0
     assert faked["frequency"].tolist() == [1e9] and faked["quality"].depth == 1
-    assert faked["reading"] == {"asset_roots": [], "variants": {}, "time": None}
+    plain = {"asset_roots": [], "variants": {}, "time": None, "untrusted": False}
+    assert faked["reading"] == plain
     (wall,) = faked["scene"].nodes
     assert wall.pose.translation.tolist() == [3.0, 3.0, 1.0]
     printed = capsys.readouterr()
@@ -196,9 +197,9 @@ def test_responses_over_band_and_time_are_written(faked, tmp_path):
 def test_reading_options_reach_the_reader(faked, tmp_path):
     arguments = ["simulate", str(faked["file"]), "--out", str(tmp_path / "o")]
     options = ["--asset-root", str(tmp_path), "--variant", "/World/Door:state=open", "--time", "24"]
-    assert cli.run([*arguments, *options]) == 0
+    assert cli.run([*arguments, *options, "--untrusted"]) == 0
     expected = {"asset_roots": [tmp_path], "variants": {"/World/Door": {"state": "open"}}}
-    assert faked["reading"] == expected | {"time": 24.0}
+    assert faked["reading"] == expected | {"time": 24.0, "untrusted": True}
 
 
 def test_receivers_come_from_a_table(faked, tmp_path):

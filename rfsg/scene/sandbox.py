@@ -41,8 +41,8 @@ UNCONFINED = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Of the child: seconds of processor time, and as many again of waiting; bytes of address space,
-    of which Python and its libraries take about 1 GiB."""
+    """Of the child: seconds of processor time, and twice as many by the clock; bytes of address space,
+    of which Python and its libraries take between 1 and 2 GiB."""
 
     seconds: float = 120.0
     memory: int = 4 * 2**30

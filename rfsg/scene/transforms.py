@@ -16,6 +16,7 @@ from rfsg.scene.pose import Pose
 TOLERANCE = 1e-5
 ALREADY_STRAIGHT = 1e-14  # rounding of a matrix product: leave such a frame bit by bit as it is
 SMALLEST_SCALE_RATIO = 1e-9  # below it a matrix flattens: its inverse has lost half the digits
+LARGEST_SCALE = 1e100  # and its inverse: squares of what lies between are numbers
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,8 @@ def broken(matrix: Float64[ndarray, "4 4"]) -> str | None:
     values = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if not values[-1] > SMALLEST_SCALE_RATIO * values[0]:
         return f"the transform is singular: it scales by {_digits(values)}"
+    if not 1 / LARGEST_SCALE < values[-1] <= values[0] < LARGEST_SCALE:
+        return f"the transform scales by {_digits(values)}: beyond what can be squared"
     return None
 
 

@@ -69,7 +69,7 @@ class Page:
             self.panel.refresh(self.picture.range_db, self.picture.map_range)
 
     def _clicked(self, path: str) -> None:
-        self._act(lambda: self.session.select(None if self.session.selected == path else path))
+        self._act(lambda: self.session.select(path))
 
     def _act(self, edit: Callable[[], Any]) -> None:
         """Do an edit and show it; what it refuses is told, not raised into a server's thread."""

@@ -116,7 +116,7 @@ class Picture:
             flat_shading=len(faces) <= 12, side="double" if opacity < 1.0 else "front",
             cast_shadow=False, receive_shadow=False, visible=opacity > 0.0,
         )  # fmt: skip
-        if not look.wall:
+        if not look.wall and not chosen:  # what is chosen leaves clicks to the gizmo in it
             handle.on_click(lambda _: self._clicked(path))
         return handle
 
@@ -139,7 +139,8 @@ class Picture:
                     name, size, color=CHOSEN if chosen else color, subdivisions=3,
                     opacity=None if named else 0.55, cast_shadow=False, receive_shadow=False,
                 )  # fmt: skip
-                ball.on_click(lambda _: self._clicked(path))
+                if not chosen:
+                    ball.on_click(lambda _: self._clicked(path))
                 if named:
                     above = (0.0, 0.0, 1.6 * size)
                     self._scene.add_label(

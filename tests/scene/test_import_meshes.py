@@ -1,5 +1,7 @@
 """Mesh files with a material table: units, axes, names, and what is refused."""
 
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -134,6 +136,7 @@ def test_rows_that_make_no_material_are_refused(table, row, message):
     [
         ("x.obj", b"v 0 0 0\nf 1 2 3\n", "line 2: a face names corner 2; there are 1"),
         ("x.obj", b"v 0 0 zero\n", "line 1: could not convert"),
+        ("x.obj", b"v 0 0 0\nv 0 0\n", "line 2: not enough values"),
         ("x.obj", b"v 0 0 0\n", "holds no faces"),
         ("x.glb", b"glTF\x02\x00\x00\x00", "cannot be read as meshes"),
         ("x.stl", b"\x00" * 10, "holds no triangles"),
@@ -166,3 +169,19 @@ def test_without_a_table_nothing_is_guessed(tmp_path):
     (tmp_path / "house.obj").write_text(OBJ)
     with pytest.raises(SceneError, match="says nothing of radio waves; give a material table"):
         import_scene(tmp_path / "house.obj", tmp_path / "house.usda")
+
+
+@pytest.mark.parametrize("change, expected", [
+    (lambda told: told["accessors"][0].update(count=10**12), "it declares 1000000000000 rows"),
+    (lambda told: told["nodes"][-1].update(matrix=[1, 2, [3]] + [0] * 13), "is no mesh|cannot be read"),
+])  # fmt: skip
+def test_a_gltf_that_declares_what_it_should_not(tmp_path, table, change, expected):
+    for name, data in trimesh.exchange.gltf.export_gltf(
+        trimesh.Scene(trimesh.creation.box())
+    ).items():
+        (tmp_path / name).write_bytes(data)
+    told = json.loads((tmp_path / "model.gltf").read_text())
+    change(told)
+    (tmp_path / "model.gltf").write_text(json.dumps(told))
+    with pytest.raises(SceneError, match=expected):
+        read_meshes(tmp_path / "model.gltf", table)

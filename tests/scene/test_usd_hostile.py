@@ -9,6 +9,7 @@ import torch
 from safetensors.torch import load, save
 
 from rfsg.scene import files, usd
+from rfsg.scene.assets import load_asset
 from rfsg.scene.scene import Scene, SceneError
 from rfsg.scene.weights import digest, pack
 from tests.scene.scene_text import cube, known
@@ -357,3 +358,82 @@ def test_random_damage_is_a_scene_error_or_a_scene(scene_file, tmp_path, capfd):
             except SceneError as error:
                 assert all("\n" not in fault for fault in error.faults)
         assert original.suffix == ".usdc" or capfd.readouterr() == ("", "")
+
+
+# what OpenUSD opens by itself
+
+MARK = "MARK-OF-WHAT-IS-OUTSIDE"
+CLIPS = """(
+    clips = {{
+        dictionary default = {{
+            asset[] assetPaths = [@{0}@]
+            asset manifestAssetPath = @{0}@
+            string primPath = "/a"
+            double2[] active = [(0, 0)]
+            double2[] times = [(0, 0), (1, 1)]
+        }}
+    }}
+)"""
+
+
+@pytest.fixture
+def outside(tmp_path):
+    """A layer outside the scenes' folder, which is no USD: whoever opens it quotes it."""
+    (tmp_path / "in").mkdir()
+    path = tmp_path / "outside.usda"
+    path.write_text(f"#usda 1.0\n{MARK}\n")
+    return path
+
+
+@pytest.mark.parametrize("path", ["../outside.usda", "{0}"])
+def test_value_clips_are_refused_before_they_are_opened(scene_file, outside, path):
+    body = f'def Xform "Clipped" {CLIPS.format(path.format(outside))}\n{{\n}}\n'
+    (fault,) = faults_of(scene_file(body, name="in/s.usda"))
+    assert "</World/Clipped>: value clips" in fault and MARK not in fault
+
+
+def test_validators_open_nothing_outside(scene_file, outside):
+    """They would follow any attribute to a layer, and that layer's, and so on."""
+    (outside.parent / "in" / "next.usda").write_text(
+        '#usda 1.0\ndef "a" {\n    custom asset b = @../outside.usda@\n}\n'
+    )
+    body = cube(extra="custom asset more = @./next.usda@")
+    path = scene_file(body, name="in/s.usda")
+    found = usd.check(path)
+    assert len(found) == 1 and "'../outside.usda' lies outside" in found[0]
+    assert not any(MARK in fault for fault in found)
+
+
+def test_an_asset_with_parts_outside_is_read_without_them(asset_here, tmp_path, capfd):
+    (tmp_path / "in").mkdir()
+    for suffix in (".usda", ".safetensors"):
+        (tmp_path / f"cabinet{suffix}").rename(tmp_path / "in" / f"cabinet{suffix}")
+    (tmp_path / "outside.usda").write_text(f"#usda 1.0\n{MARK}\n")
+    path = tmp_path / "in" / "cabinet.usda"
+    weights = "custom asset rfsg:neural:weights"
+    more = f"custom asset more = @../outside.usda@\n    {weights}"
+    path.write_text(path.read_text().replace(weights, more))
+    loaded = load_asset(path)
+    assert loaded.parts == () and capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    "scale, words", [("1e60", "inf"), ("1e300", "scales by"), ("1e-200", "scales by")]
+)
+def test_sizes_that_overflow_with_their_scale(scene_file, scale, words):
+    ops = f"double size = 1e300\n        double3 xformOp:scale = ({scale}, {scale}, {scale})"
+    (fault,) = faults_of(scene_file(cube(ops=ops, order='"xformOp:scale"')))
+    assert fault.startswith("/World/Wall: ") and words in fault
+
+
+def test_a_tensor_that_declares_more_than_the_file_holds(scene_file, tmp_path, small_asset):
+    data = pack(small_asset[0])
+    size = int.from_bytes(data[:8], "little")
+    told = json.loads(data[8 : 8 + size])
+    name = next(k for k in told if k != "__metadata__")
+    told[name] |= {"shape": [2**40], "data_offsets": [0, 2**42]}
+    text = json.dumps(told).encode()
+    (fault,) = net_faults(
+        scene_file, tmp_path, len(text).to_bytes(8, "little") + text + data[8 + size :]
+    )
+    assert "not a safetensors file that can be read" in fault

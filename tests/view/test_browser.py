@@ -29,7 +29,7 @@ def session(tmp_path):
         box_node("/World/Wall", (0.0, 3.0, 1.5), (4.0, 0.1, 1.5)),
         box_node(BOX, (0.0, 0.2, 0.5), (0.4, 0.3, 0.5)),
     )
-    radios = (radio("/tx", -2.0, 0.0, 0.8),), (radio("/rx", 2.5, 0.2, 0.9),)
+    radios = (radio("/tx", -2.0, 0.0, 0.8),), (radio("/rx", 2.5, 0.9, 0.9),)
     scene = Scene(nodes, *radios, 2.4e9)
     post = Body(Box((0.15, 0.15, 0.9)), concrete())
     Scene((replace(nodes[1], body=post),)).export(BOX, tmp_path / "post")
@@ -79,7 +79,7 @@ def test_drag_and_swap_with_the_mouse(session: Session, tmp_path):
             until(lambda: session.selected == BOX)
 
             page.wait_for_timeout(1000)  # the gizmo, too
-            arrow = place + [0.5, 0.0, 0.0]
+            arrow = place + [0.35, 0.0, 0.0]
             drafts = []
             heard = session.changed
             session.changed = lambda: (drafts.append(not session.answer.settled), heard())

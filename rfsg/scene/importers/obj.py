@@ -40,7 +40,8 @@ def read_obj(path: Path) -> list[Group]:
         words = line.split()
         try:
             if words[:1] == ["v"]:
-                points.append([float(w) for w in words[1:4]])
+                x, y, z = words[1:4]
+                points.append([float(x), float(y), float(z)])
             elif words[:1] == ["f"]:
                 polygon = [_index(w, len(points)) for w in words[1:]]
                 faces.setdefault((name, material), []).append(polygon)
@@ -51,8 +52,8 @@ def read_obj(path: Path) -> list[Group]:
         except ValueError as error:
             raise SceneError([f"{path}: line {number}: {error}"]) from error
     place = np.array(points, dtype=np.float64) if points else np.zeros((0, 3))
-    if place.ndim != 2 or place.shape[1] != 3 or not np.isfinite(place).all():
-        raise SceneError([f"{path}: corners that are not three finite numbers"])
+    if not np.isfinite(place).all():
+        raise SceneError([f"{path}: corners that are not finite"])
     if not faces:
         raise SceneError([f"{path}: holds no faces"])
     return [_group(*key, place, polygons) for key, polygons in faces.items()]

@@ -288,7 +288,8 @@ class Reader:
         if "height" in sizes:
             placement = shapes.turned(prim, placement)
         try:
-            token, lengths = shapes.measure(kind, sizes, placement)
+            with np.errstate(over="ignore"):  # said below
+                token, lengths = shapes.measure(kind, sizes, placement)
         except ValueError as error:
             raise SceneError([f"{prim.GetPath()}: a {kind} cannot be {error}"]) from error
         length = np.hstack([np.zeros(0), *lengths.values()])
