@@ -35,6 +35,7 @@ from rfsg.cli.parse import (
     parse_plane,
     parse_quality,
 )
+from rfsg.cli.results import Usd, print_usd, refuse_usd
 from rfsg.cli.scenes import Edits, asked_of_scene, device_named, edit, read_scene
 from rfsg.cli.terminal import bar, note, print_files
 
@@ -129,6 +130,7 @@ def map_(
             help="By rays: refine until the median standard error of the cells is below this.",
         ),
     ] = None,
+    usd: Usd = False,
     frequency: Frequency = None,
     quality: Preset = "standard",
     changes: Changes = [],
@@ -147,7 +149,7 @@ def map_(
 ) -> None:
     """Received power, path loss, SINR and best server over a plane or over an object.
 
-    Writes map.png, map.npz and report.json into --out.
+    Writes map.png, map.npz and report.json into --out, with --usd also map.usda.
 
     Example: rfsg map lab.usda --height 1.2 --cell 0.25 --metric sinr --noise-figure 7 --out map
     """
@@ -157,6 +159,7 @@ def map_(
     given = [name for name, value in chosen.items() if value is not None]
     if len(given) > 1 or (on is not None and bounds is not None):
         raise typer.BadParameter("--height, --plane, --on: give one; --bounds goes with a plane")
+    refuse_usd(usd, untrusted)
     question = parse_quality(quality, changes)
     report.refuse_taken(out, overwrite)
     edits = Edits(move, swap, remove, add, save)
@@ -200,6 +203,8 @@ def map_(
     for warning in found.warnings:
         note(warning)
     print_files(out, ("map.npz", "map.png", "report.json"))
+    if usd:
+        print_usd(found, out / "map.usda", overwrite)
 
 
 def _shown(

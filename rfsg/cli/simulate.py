@@ -36,6 +36,7 @@ from rfsg.cli.parse import (
     parse_pair,
     parse_quality,
 )
+from rfsg.cli.results import Usd, print_usd, refuse_usd
 from rfsg.cli.scenes import Edits, asked_of_scene, device_named, edit, read_scene
 from rfsg.cli.terminal import bar, note, print_files, print_table
 
@@ -99,6 +100,7 @@ def simulate(
         list[Layout],
         typer.Option(help="Also write the channel as this tool reads it (repeatable)."),
     ] = [],
+    usd: Usd = False,
     asset_root: Roots = [],
     variant: Variants = [],
     time: Time = None,
@@ -110,7 +112,7 @@ def simulate(
     """Find every path between the scene's radios, and the channels they make.
 
     Writes links.csv, paths.csv, channel.npz, report.json, scene.png and pdp.png into --out; with
-    --channel also cir.npz (Sionna) or a folder deepmimo.
+    --channel also cir.npz (Sionna) or a folder deepmimo, with --usd paths.usda.
 
     --accuracy or --budget take the place of --quality: the setting is chosen by pilot runs.
 
@@ -126,6 +128,7 @@ def simulate(
         raise typer.BadParameter(
             "--accuracy and --budget choose the quality: leave out --quality, --set"
         )
+    refuse_usd(usd, untrusted)
     question, carriers = parse_quality(quality, changes), parse_frequencies(frequency)
     report.refuse_taken(out, overwrite)
     edits = Edits(move, swap, remove, add, save)
@@ -173,6 +176,8 @@ def simulate(
         note(warning)
     print_files(out, ("links.csv", "paths.csv", "channel.npz", "report.json"))
     print_files(out, ("scene.png", "pdp.png"))
+    if usd:
+        print_usd(result, out / "paths.usda", overwrite)
 
 
 def _chosen_links(scene: "Scene", result: "Result", asked: list[str]) -> list[tuple[int, int]]:

@@ -17,6 +17,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -81,6 +82,16 @@ class RadioMap(Displayed):
     def to_pandas(self) -> Any:
         """A pandas.DataFrame, one row per transmitter and cell: the same quantities."""
         return map_dataset(self).to_dataframe()
+
+    def to_usd(self, path: str | Path, overwrite: bool = False) -> Path:
+        """Write the best server's signal as a coloured mesh, in a layer over the scene's source; see
+        ``rfsg.scene.usd.results.write_map``."""
+        from rfsg.scene.usd.results import write_map
+        from rfsg.tracer.drawing import map_faces
+
+        drawn = map_faces(self)
+        rss_dbm = self.best_dbm().reshape(-1).numpy()[drawn.cell]
+        return write_map(self.scene, path, drawn.vertices, drawn.faces, rss_dbm, overwrite)
 
     def current_error_db(self) -> float:
         """Median standard error over the cells that hear something [dB]; 0 where nothing scatters."""

@@ -202,10 +202,9 @@ def _round(
 
 
 def _twins(part: Batch, moved: Tensor) -> Tensor:
-    """All but one of the chains of one sequence that have come to the same place."""
+    """All but one of the chains of one link and one sequence that have come to the same place."""
     cell = torch.round(moved.flatten(1) / SAME).to(torch.int64)
-    ends = torch.round(torch.cat([part.tx, part.rx], 1) / SAME).to(torch.int64)
-    key = torch.cat([ends, part.which, cell], 1)
+    key = torch.cat([part.link[:, None], part.which, cell], 1)
     _, group = torch.unique(key, dim=0, return_inverse=True)
     order = torch.argsort(moved.flatten(1).sum(1), stable=True)  # whose turn it is says nothing
     order = order[torch.argsort(group[order], stable=True)]

@@ -5,8 +5,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
@@ -109,6 +111,18 @@ class Result(Displayed):
         if what not in frames:
             raise ValueError(f"{what!r}: expected one of {', '.join(frames)}")
         return frames[what](self)
+
+    def to_usd(self, path: str | Path, overwrite: bool = False) -> Path:
+        """Write the paths as curves, coloured by gain at the first frequency, in a layer over the
+        scene's source; see ``rfsg.scene.usd.results.write_paths``."""
+        from rfsg.scene.usd.results import write_paths
+        from rfsg.tracer.drawing import path_lines
+
+        lines = path_lines(self)
+        gain_db = np.array([line.gain_db for line in lines])
+        delay_s = np.array([line.delay_ns for line in lines]) * 1e-9
+        points = [line.points for line in lines]
+        return write_paths(self.scene, path, points, gain_db, delay_s, overwrite)
 
     def __repr__(self) -> str:
         hertz = ", ".join(f"{f / 1e9:g}" for f in self.frequency.tolist())

@@ -130,11 +130,16 @@ def test_without_polarised_radios_scalars_carry_the_same_power_in_free_space():
 
 
 def test_path_gain_differentiates_in_pose_and_places(result):
-    """A person on a path and the receiver, moved: autograd against central differences on kept chains."""
+    """A person on a path and the receiver, moved: autograd against central differences on kept chains.
+
+    But for mirrors on learned faces: their zone is held while they are differentiated, which is not what
+    a difference sees (docs/design.md).
+    """
     scene = result.scene.with_receivers([result.scene.receivers[0]])
     index = scene.index("/World/Person")
     quality = replace(QUALITY, depth=1)
     chains = simulate(scene, quality=quality).chains
+    exact = torch.tensor([node.body.shape.exact for node in scene.nodes])
 
     def power(x, gradients: bool):
         node = scene.nodes[index]
@@ -144,7 +149,9 @@ def test_path_gain_differentiates_in_pose_and_places(result):
         rx = replace(scene.receivers[0], position=scene.receivers[0].position + x[3:])
         moved = replace(scene, nodes=tuple(nodes), receivers=(rx,))
         found = simulate(moved, quality=quality, gradients=gradients, chains=chains)
-        value = coefficients(found.channel)[:, 0]
+        which = found.paths.which
+        known = ((which < 0) | exact[which]).all(1)
+        value = coefficients(found.channel)[known, 0]
         # powers of paths, not of their sum: no fading to differ by
         return (value.real**2 + value.imag**2).sum() * 1e6
 
@@ -155,5 +162,4 @@ def test_path_gain_differentiates_in_pose_and_places(result):
         h = torch.zeros(6, dtype=torch.float64)
         h[k] = 1e-5
         expected = float(power(h, False) - power(-h, False)) / 2e-5
-        # to 1e-6 but for mirrors on learned faces, whose zone is held while they are differentiated
-        assert float(found[k]) == pytest.approx(expected, rel=1e-3, abs=1e-6)
+        assert float(found[k]) == pytest.approx(expected, rel=1e-6, abs=1e-9)

@@ -135,20 +135,15 @@ def _neural_values(
         story = json.dumps(provenance, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise SceneError([f"{root.GetPath()}: the provenance is not JSON: {error}"]) from error
-    low, high = _bounds(root, body.shape)
+    low, high = _bounds(body.shape)
     path = Sdf.AssetPath(f"./{stem}.safetensors")
     slope, band = float(body.shape.lipschitz), body.band or (None, None)
     return path, FORMAT_VERSION, digest(weights), low, high, slope, story, *band
 
 
-def _bounds(root: Usd.Prim, shape: Shape) -> list[Gf.Vec3f]:
-    bounds = shape.bounds().detach().cpu()
-    if not bool(bounds.isfinite().all()):
-        raise SceneError(
-            [f"{root.GetPath()}: a {shape.kind} has no bounds, so no asset can hold it; "
-             "write it into the scene itself"]
-        )  # fmt: skip
-    return [Gf.Vec3f(*row) for row in bounds.tolist()]
+def _bounds(shape: Shape) -> list[Gf.Vec3f]:
+    """The corners of what it may take up; those of a half-space are infinite."""
+    return [Gf.Vec3f(*row) for row in shape.bounds().detach().cpu().tolist()]
 
 
 def _show(root: Usd.Prim, picture: str) -> None:
