@@ -200,7 +200,7 @@ def test_what_is_no_triangle_is_left_out():
         ([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], "without a triangle that has an area"),
         ([[0.0, 0, float("nan")]] * 3, [[0, 1, 2]], "expected finite"),
         (SQUARE[0], [[0, 1, 4]], "outside of 0 to 3"),
-        (SQUARE[0], [[0.0, 1, 2]], "expected 1 to"),
+        (SQUARE[0], np.array([[0.0, 1, 2]]), "expected 1 to"),
         (SQUARE[0], np.zeros((0, 3), int), "expected 1 to"),
     ],
 )
