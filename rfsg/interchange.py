@@ -8,8 +8,8 @@ Both tools take it so. Angles: azimuth from +x towards +y, zenith from +z, in th
 look from the receiver back to the wave.
 """
 
+import io
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ from rfsg.objects.plain import array
 from rfsg.report import output_folder, write_json
 from rfsg.scene.errors import SceneError
 from rfsg.scene.radios import port_names
+from rfsg.scene.weights import write_beside
 from rfsg.tracer.mimo import port_gains
 from rfsg.tracer.pathtable import arriving, crossed_by_path
 from rfsg.tracer.records import Act
@@ -192,14 +193,10 @@ def write_sionna(
 
 def _save(file: Path, **arrays: Any) -> None:
     """Written beside its place, then renamed."""
-    beside = file.with_name(f".{file.name}")
     plain: dict[str, Any] = {name: array(value) for name, value in arrays.items()}
-    try:
-        with open(beside, "wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **plain)
-        os.replace(beside, file)
-    finally:
-        beside.unlink(missing_ok=True)
+    data = io.BytesIO()
+    np.savez_compressed(data, allow_pickle=False, **plain)
+    write_beside(file, data.getvalue(), overwrite=True)
 
 
 def _slots(result: "Result") -> dict[tuple[int, int], Int[ndarray, "m"]]:

@@ -1,6 +1,5 @@
 """All crossings of rays with a baked shape, for the march."""
 
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 
 import torch
@@ -8,6 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Shape
+from rfsg.objects.recent import Recent
 from rfsg.objects.shapes.band import WAYS, Baked
 from rfsg.tracer.banded import bracketed, polished
 from rfsg.tracer.intersect import BEHIND, Intersector
@@ -89,17 +89,9 @@ def _peeled(
     return Roots(row, slot, t, count, inside)
 
 
-_BUILT: OrderedDict[str, tuple[Shape, Intersector]] = (
-    OrderedDict()
-)  # the one asked last stands last
+_BUILT: Recent[Intersector] = Recent(MOST_BUILT)
 
 
 def intersector(shape: Shape, baked: Baked) -> Intersector:
     """The shape's ``Intersector``, kept by key: building Embree's trees takes a second."""
-    kept = _BUILT.get(baked.key)
-    if kept is None or kept[0] is not shape:
-        kept = _BUILT[baked.key] = (shape, Intersector(shape, baked))
-    _BUILT.move_to_end(baked.key)
-    if len(_BUILT) > MOST_BUILT:
-        _BUILT.popitem(last=False)
-    return kept[1]
+    return _BUILT.get(baked.key, shape, lambda: Intersector(shape, baked))

@@ -5,10 +5,10 @@ server and is left out; a card of numbers takes its place.
 """
 
 import html
-import os
 from pathlib import Path
 
 from rfsg.scene.colours import MAP, PATHS
+from rfsg.scene.weights import write_beside
 from rfsg.view import words
 from rfsg.view.page import Page
 from rfsg.view.session import Session
@@ -28,9 +28,7 @@ def write_html(session: Session, file: Path, title: str = "rfsg") -> Path:
         page.close()
     text = text.replace("<title>Viser</title>", f"<title>{html.escape(title)}</title>")
     end = text.rindex("</body>")
-    beside = file.with_name(f".{file.stem}-partial{file.suffix}")
-    beside.write_text(text[:end] + card + text[end:], encoding="utf-8")
-    os.replace(beside, file)
+    write_beside(file, (text[:end] + card + text[end:]).encode(), overwrite=True)
     return file
 
 

@@ -111,9 +111,7 @@ class Author:
             if node.asset not in self.records:
                 self.records[node.asset] = read_asset(Path(node.asset))
             record = self.records[node.asset]
-            own = same_bits(node.body.surface, record.body.surface)
-            own = own and node.body.band == record.body.band
-            same = same_bits(node.body.shape, record.body.shape) and (own or material is not None)
+            own, same = record.holds(node.body, otherwise_bound=material is not None)
             if same and record.referable:
                 return Path(node.asset).absolute(), own
         if id(node.body) not in self.saved:

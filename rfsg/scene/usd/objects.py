@@ -18,7 +18,7 @@ from rfsg.scene.usd.attributes import values_of
 from rfsg.scene.usd.composition import arcs, layer_of, metre_of, up_of
 from rfsg.scene.usd.faults import quiet
 from rfsg.scene.usd.layers import asset_bytes, asset_path, gathered, open_stage
-from rfsg.scene.weights import MAX_WEIGHTS_BYTES, digest, unpack
+from rfsg.scene.weights import MAX_WEIGHTS_BYTES, digest, same_bits, unpack
 
 WEIGHTS = NEURAL[0].name
 
@@ -41,6 +41,12 @@ class AssetRecord:
     extent: np.ndarray | None
     referable: bool
     parts: tuple[Path, ...]
+
+    def holds(self, body: Body, otherwise_bound: bool) -> tuple[bool, bool]:
+        """(whether the asset has the body's surface and band too, whether it can stand for the body): it
+        has the same shape, and the surface or one that is ``otherwise_bound`` where it is referenced."""
+        own = same_bits(body.surface, self.body.surface) and body.band == self.body.band
+        return own, same_bits(body.shape, self.body.shape) and (own or otherwise_bound)
 
 
 def read_asset(path: Path) -> AssetRecord:

@@ -26,7 +26,7 @@ from rfsg.scene.usd.packaging import write_asset
 from rfsg.scene.usd.radios import author_radio
 from rfsg.scene.usd.reading import Source
 from rfsg.scene.usd.shapes import PRIM_TYPES, author_shape
-from rfsg.scene.weights import refuse_overwrite, same_bits, write_beside
+from rfsg.scene.weights import refuse_overwrite, write_beside
 
 
 def write(scene: Scene, path: str | Path, overwrite: bool = False) -> Path:
@@ -107,9 +107,7 @@ class _Writer:
             if node.asset not in self.records:
                 self.records[node.asset] = read_asset(Path(node.asset))
             record = self.records[node.asset]
-            own = same_bits(node.body.surface, record.body.surface)
-            own = own and node.body.band == record.body.band
-            same = same_bits(node.body.shape, record.body.shape) and (own or material is not None)
+            own, same = record.holds(node.body, otherwise_bound=material is not None)
             file = Path(node.asset).absolute()
             here = not files.outside(str(file), [files.default_root(self.path)])
             if same and record.referable and (here or record.parts):
