@@ -158,6 +158,9 @@ def measured(side: str, name: str, threads: int) -> dict:
     """One process that answers and ends, and one that goes on."""
     python = PEER if side == "sionna" else Path(sys.executable)
     environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
+    environment.pop(
+        "PYTHONDONTWRITEBYTECODE", None
+    )  # both compiled once, as an installed package is
     command = [str(python), __file__, "--side", side, name]
 
     def run(calls: int) -> dict:

@@ -1,5 +1,6 @@
 """``rfsg``: the commands, put together and run."""
 
+import gc
 import sys
 import traceback
 from collections.abc import Callable
@@ -63,6 +64,7 @@ def _root(
 
 def main() -> None:
     """Entry point of ``rfsg``."""
+    gc.set_threshold(50_000, 10, 10)  # or it looks through torch's modules again and again
     sys.exit(run(sys.argv[1:]))
 
 

@@ -22,8 +22,8 @@ from torch.nn import functional as F
 from rfsg.objects.contract import Jet
 from rfsg.objects.shapes.sweeps import SHARE, Question, ShapeSweep, answer
 
-# Points per sweep when no gradients are recorded: what 2048 of them leave on the way, 5 MB, stays in
-# the cache of a CPU; a GPU wants many more.
+# Points of a core and sweep when no gradients are recorded: what 2048 leave on the way, 5 MB, stays in
+# its cache; a GPU wants many more.
 CPU_CHUNK, GPU_CHUNK = 2_048, 262_144
 
 
@@ -308,7 +308,7 @@ def _in_chunks(sweep: Callable[[Tensor], tuple[Tensor, ...]], point: Tensor) -> 
 
 
 def _chunk(flat: Tensor) -> int:
-    return CPU_CHUNK if flat.device.type == "cpu" else GPU_CHUNK
+    return CPU_CHUNK * torch.get_num_threads() if flat.device.type == "cpu" else GPU_CHUNK
 
 
 def _reshaped(parts: tuple[Tensor, ...], point: Tensor) -> tuple[Tensor, ...]:
