@@ -32,10 +32,12 @@ bench: .venv/.installed-dev
 	$(BIN)/python benchmarks/intersect.py --write-docs
 	$(BIN)/python benchmarks/solver.py --write-docs
 	$(BIN)/python benchmarks/maps.py --write-docs
+	$(BIN)/python benchmarks/maps.py --memory --write-docs
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/objects.py --write-docs
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/edits.py --write-docs
 	$(BIN)/python benchmarks/dial.py
 	$(BIN)/python benchmarks/tradeoffs.py --write-docs
+	$(BIN)/python benchmarks/goals.py --write-docs
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .
