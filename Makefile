@@ -36,6 +36,7 @@ bench: .venv/.installed-dev
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/objects.py --write-docs
 	OMP_NUM_THREADS=1 $(BIN)/python benchmarks/edits.py --write-docs
 	$(BIN)/python benchmarks/dial.py
+	$(BIN)/python benchmarks/widths.py --write-docs
 	$(BIN)/python benchmarks/tradeoffs.py --write-docs
 	$(BIN)/python benchmarks/goals.py --write-docs
 

@@ -1,19 +1,20 @@
 """From an edit to the new channel: going on from the last result against a full run.
 
-    OMP_NUM_THREADS=1 python benchmarks/edits.py [--write-docs] [--limit 20]
+    OMP_NUM_THREADS=1 python benchmarks/edits.py [--write-docs] [--minutes 11]
 
 A hall with six concrete walls and upright boxes of metal, wood and glass in it; receivers anywhere.
 Each row is one edit of the hall, answered once with the earlier result and once in full, by turns, in
 seconds of the processor; ratios are of each such pair. Where a full run takes more than ``PATIENCE``,
-two edits and one pair are measured; where more than ``--limit``, nothing. The two answers are compared:
-as many paths, the same path gains.
+one pair is measured, and of the edits two where the table is to hold many. Where the time that is left
+does not do for a row's full run, the row is left out and named. The two answers are compared: as many
+paths, the same path gains.
 """
 
 import argparse
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -27,28 +28,41 @@ from rfsg.objects.surfaces.slab import Slab
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
 from rfsg.scene.scene import Node, Scene
+from rfsg.tracer.incremental import Redone
 from rfsg.tracer.simulate import Result, simulate
 
 DOCS = ROOT / "docs" / "edits.md"
 SIZE = (20.0, 14.0, 3.0)  # [m] of a hall of 20 objects; its floor grows with them
 WALL = 0.1  # [m], half the thickness of a wall
-PATIENCE = 2.5  # [s]
-FIRST = ("move", "material")  # the edits that are measured always
+PATIENCE = 2.5  # [s] of a full run
+FIRST = ("move", "material")  # the edits that are measured however long a full run takes
+LAST = "move a receiver"  # in the details alone: no thing that is edited
+# receivers at most, where a full run of more takes minutes, and gigabytes
+MOST = {("standard", 200): 1}
 SAME = 1e-9  # of a gain: what a full run may differ by
 SAID = """# From an edit to the new channel
 
 Written by `OMP_NUM_THREADS=1 python benchmarks/edits.py --write-docs`.
 
 `result.after(scene)`, or `simulate(scene, previous=result)`, does again what an edit changes, and keeps
-the rest; `result.redone` counts it. The answer is a full run's: the same paths, gains to 1e-9
-(`tests/tracer/test_incremental.py`, 200 random edits). A hall with walls and upright boxes, one
-transmitter. *After*, *full*: seconds of the processor, medians of pairs by turns. *Ratio*: of the pairs,
-median and range, one pair where a full run is long. *Kept*, *evaluated*, *traced*: paths of which nothing
-was done, whose field was evaluated again, and, of these, that were found or traced again.
+the rest. The answer is a full run's: the same paths, gains to 1e-9 (`tests/tracer/test_incremental.py`,
+200 random edits). Of one box or receiver in a hall with walls and upright boxes, one transmitter: seconds
+of the processor after the edit -> of a full run, and their ratio.
+"""
+WHY = """## What an edit costs
 
-An edit of one box costs what the paths that meet it cost, and a material no search at all. What is
-paid whatever the edit: the scene as tensors, and copies of what is kept; in small scenes, that is most of
-it. Where the search launches rays (many objects and mirrors), it launches all of them again.
+- The paths that meet what changed, where it was or where it is: found, traced and evaluated again.
+- A material: no search and no geometry, the field of the paths that meet it.
+- The search for what is new: of planar faces it follows sequences to their last face only where they
+  meet something new (`rfsg.tracer.renewed`). Where a power floor drops sequences, or among curved and
+  learned faces, it looks at all beginnings again; where rays are launched, it launches all of them.
+- Whatever the edit: the scene as tensors, and copies of what is kept. In small scenes, most of it.
+
+## In detail
+
+Medians of pairs by turns, and the range of the ratios; one pair where a full run is long. *Kept*,
+*evaluated*, *traced*: paths of which nothing was done, whose field was evaluated again and, of these, that
+were found or traced again (`result.redone`).
 """
 
 
@@ -113,11 +127,43 @@ def timed(work: Callable[[], Result]) -> tuple[float, Result]:
     return time.process_time() - begin, result
 
 
-def row(
+@dataclass(frozen=True)
+class Row:
+    """One edit of one hall: seconds and ratios of its pairs, and what the last of them did again."""
+
+    quality: str
+    receivers: int
+    objects: int
+    edit: str
+    after: list[float]
+    full: list[float]
+    redone: Redone
+
+    @property
+    def ratio(self) -> list[float]:
+        return [a / b for a, b in zip(self.after, self.full, strict=True)]
+
+    def short(self) -> str:
+        """A cell of the table above."""
+        after, full, ratio = map(statistics.median, (self.after, self.full, self.ratio))
+        return f"{after:.2g} -> {full:.2g}: {ratio:.0%}"
+
+    def long(self) -> str:
+        """A line of the table below."""
+        after, full, ratio = map(statistics.median, (self.after, self.full, self.ratio))
+        done = self.redone
+        return (
+            f"| {self.quality} | {self.receivers} | {self.objects} | {self.edit} | {after:.3f} "
+            f"| {full:.2f} | {ratio:.1%} ({min(self.ratio):.1%} to {max(self.ratio):.1%}) "
+            f"| {done.kept} | {done.evaluated} | {done.traced} |"
+        )
+
+
+def measured(
     scene: Scene, quality: str, name: str, edit: Callable[[int], Scene], before: Result, pairs: int
-) -> str:
-    """One line of the table."""
-    after, full, ratios, redone = [], [], [], None
+) -> Row:
+    """One edit, another number for each pair."""
+    after, full = [], []
     for k in range(pairs):
         edited = edit(k)
         some, found = timed(lambda s=edited: simulate(s, previous=before))
@@ -125,19 +171,10 @@ def row(
         compare(found, whole)
         after.append(some)
         full.append(every)
-        ratios.append(some / every)
-        redone = found.redone
-    assert redone is not None
-    low, high = min(ratios), max(ratios)
-    search = "enumerated" if before.search.enumerated else "rays"
-    line = (
-        f"| {quality} | {len(scene.receivers)} | {len(scene.nodes)} | {name} | {search} "
-        f"| {statistics.median(after):.3f} | {statistics.median(full):.2f} "
-        f"| {statistics.median(ratios):.1%} ({low:.1%} to {high:.1%}) "
-        f"| {redone.kept} | {redone.evaluated} | {redone.traced} |"
-    )
-    print(line, flush=True)
-    return line
+    assert found.redone is not None
+    row = Row(quality, len(scene.receivers), len(scene.nodes), name, after, full, found.redone)
+    print(row.long(), flush=True)
+    return row
 
 
 def compare(found: Result, full: Result) -> None:
@@ -149,8 +186,43 @@ def compare(found: Result, full: Result) -> None:
         raise SystemExit(f"not the same: {counts} paths, path gains apart by {worst:.1e}")
 
 
-COLUMNS = "quality receivers objects edit search after full ratio kept evaluated traced".split()
-HEAD = f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}"
+def table(columns: Sequence[str]) -> str:
+    """The head of a table."""
+    return f"| {' | '.join(columns)} |\n|{' --- |' * len(columns)}"
+
+
+def first_table(rows: list[Row]) -> str:
+    """A line for each hall and quality, a column for each edit of a thing."""
+    names = list(dict.fromkeys(r.edit for r in rows if r.edit != LAST))
+    lines = [table(["quality", "receivers", "objects", *names])]
+    halls = dict.fromkeys((r.quality, r.receivers, r.objects) for r in rows)
+    for hall in halls:
+        cells = {r.edit: r.short() for r in rows if (r.quality, r.receivers, r.objects) == hall}
+        lines.append(f"| {' | '.join([*map(str, hall), *(cells.get(n, '') for n in names)])} |")
+    return "\n".join(lines)
+
+
+COLUMNS = "quality receivers objects edit after full ratio kept evaluated traced".split()
+
+
+class Clock:
+    """The time that the whole may take."""
+
+    def __init__(self, minutes: float):
+        self.begin, self.most = time.perf_counter(), 60.0 * minutes
+
+    def spent(self) -> float:
+        return time.perf_counter() - self.begin
+
+    def left(self) -> float:
+        return self.most - self.spent()
+
+
+def write(rows: list[Row], left_out: list[str], clock: Clock) -> None:
+    left = f"Left out for the time they take: {'; '.join(left_out)}.\n" * bool(left_out)
+    details = "\n".join([table(COLUMNS), *(r.long() for r in rows)])
+    said = measured_on(clock.spent())
+    write_page(DOCS, SAID, first_table(rows), "", WHY, details, "", left, said)
 
 
 def main() -> None:
@@ -158,34 +230,34 @@ def main() -> None:
     parser.add_argument("--receivers", type=int, nargs="+", default=[1, 100, 1000])
     parser.add_argument("--objects", type=int, nargs="+", default=[5, 20, 200])
     parser.add_argument("--qualities", nargs="+", default=["draft", "standard"])
-    parser.add_argument("--limit", type=float, default=60.0, help="seconds of a full run")
+    parser.add_argument("--minutes", type=float, default=11.0, help="that all may take")
     parser.add_argument("--pairs", type=int, default=3)
     parser.add_argument("--write-docs", action="store_true")
-    asked, begin, lines = parser.parse_args(), time.perf_counter(), [HEAD]
+    asked = parser.parse_args()
+    clock, rows, left_out = Clock(asked.minutes), [], []
     torch.set_grad_enabled(False)
-    slow: list[str] = []
-
-    def write() -> None:
-        left = f"Left out, a full run takes too long: {'; '.join(slow)}." * bool(slow)
-        said = measured_on(time.perf_counter() - begin)
-        write_page(DOCS, SAID, "\n".join(lines), "", left, "", said)
-
-    for objects in asked.objects:
-        for quality in asked.qualities:
+    for quality in asked.qualities:
+        for objects in asked.objects:
+            longest = 0.0
             for receivers in asked.receivers:
+                many = receivers > MOST.get((quality, objects), receivers)
+                if many or 3 * longest > clock.left():
+                    left_out.append(f"{quality}, {receivers} receivers, {objects} objects")
+                    continue
                 scene = hall(objects, receivers)
-                taken, before = timed(lambda s=scene, q=quality: simulate(s, quality=q))
-                if taken > asked.limit:
-                    slow.append(
-                        f"{quality}, {receivers} receivers, {objects} objects: {taken:.0f} s"
-                    )
-                    break  # more receivers take longer
-                pairs = asked.pairs if taken < PATIENCE else 1
+                longest, before = timed(lambda s=scene, q=quality: simulate(s, quality=q))
+                pairs = asked.pairs if longest < PATIENCE else 1
                 for name, edit in edits(scene).items():
-                    if taken < PATIENCE or name in FIRST:
-                        lines.append(row(scene, quality, name, edit, before, pairs))
+                    if longest > PATIENCE and name not in FIRST:
+                        continue
+                    if longest > clock.left():
+                        left_out.append(
+                            f"{quality}, {receivers} receivers, {objects} objects, {name}"
+                        )
+                        continue
+                    rows.append(measured(scene, quality, name, edit, before, pairs))
                 if asked.write_docs:  # what is measured so far
-                    write()
+                    write(rows, left_out, clock)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
 """Radio maps: how fast, how exact, how much memory? Against the exact sum, and a peer where there is one.
 
-    python benchmarks/maps.py [--runs 5] [--threads 2] [--rays N] [--memory] [--write-docs]
+    python benchmarks/maps.py [--runs 5] [--threads 2] [--rays N] [--peer-rays N] [--memory]
+                              [--write-docs]
 
 The street canyon of ``peers/cases.py``: 180 x 120 cells of 1 m, 3 reflections, 3.5 GHz. The truth is
 the path solver's incoherent sum at cells' middles (``method="paths"``), at 400 of them, drawn once.
 Where ``peers/.venv`` exists, Sionna RT's RadioMapSolver runs in a process of its own that takes turns
 with rfsg's methods: figures of one run share its load. Each figure is a median (least to most); the
-processor's seconds, of all threads, say what it was without the load.
+processor's seconds, of all threads, say what it was without the load. ``--rays``: rfsg's rays as well;
+``--peer-rays``: Sionna's once more with so many, whose error against the exact map says what an error
+costs there. Ways by rays take as many turns as the others, or ``FEW`` above ten times a million rays.
 """
 
 import argparse
@@ -26,6 +29,8 @@ PEER = HERE / "peers" / ".venv" / "bin" / "python"
 SIZE, HEIGHT, CELL = (180.0, 120.0), 1.5, 1.0  # [m]
 CASE = "canyon 3.5 GHz"
 DRAWN = 400  # cells of the truth
+PEER_RAYS = 1_000_000
+FEW, MANY = 2, 10_000_000  # turns of a way of so many rays
 PAGE = HERE.parent / "docs" / "performance.md"
 SAID = {
     "## A radio map of a street": """
@@ -119,7 +124,7 @@ class Server:
         self.process.wait()
 
 
-def compare(runs: int, threads: int, rays: int) -> list[str]:
+def compare(runs: int, threads: int, rays: int, peer_rays: int) -> list[str]:
     """Prints the table."""
     import numpy as np
 
@@ -128,14 +133,19 @@ def compare(runs: int, threads: int, rays: int) -> list[str]:
     # Sionna's process has no thread count of its own: Dr.Jit takes the cores it may run on
     peer = Server(str(PEER), "sionna", threads) if PEER.exists() else None
     ways = {"rfsg, images": (ours, f"images 1 {WORK}/0.npy")}
-    if peer is not None:
-        ways["Sionna RT, 1,000,000 rays"] = (peer, f"1000000 {WORK}/1.npy")
+    turns = dict.fromkeys(ways, runs + 1)
+    for count in (PEER_RAYS, peer_rays) if peer is not None else ():
+        if count:
+            ways[name := f"Sionna RT, {count:,} rays"] = (peer, f"{count} {WORK}/s{count}.npy")
+            turns[name] = runs + 1 if count < MANY else FEW + 1
     if rays:
-        ways[f"rfsg, {rays:,} rays"] = (ours, f"rays {rays} {WORK}/2.npy")
+        ways[name := f"rfsg, {rays:,} rays"] = (ours, f"rays {rays} {WORK}/r{rays}.npy")
+        turns[name] = runs + 1 if rays < MANY else FEW + 1
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in ways}
-    for _ in range(runs + 1):
+    for turn in range(runs + 1):
         for name, (server, line) in ways.items():
-            times[name].append(server.ask(line))
+            if turn < turns[name]:
+                times[name].append(server.ask(line))
         print({n: t[-1] for n, t in times.items()}, file=sys.stderr, flush=True)
     for server in (ours, peer):
         if server is not None:
@@ -233,6 +243,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--rays", type=int, default=0, help="rfsg's rays as well: so many")
+    parser.add_argument("--peer-rays", type=int, default=0, help="Sionna's once more: so many")
     parser.add_argument("--memory", action="store_true", help="a million cells: peak memory")
     parser.add_argument("--write-docs", action="store_true", help=f"a section of {PAGE.name}")
     parser.add_argument("--serve", help=argparse.SUPPRESS)
@@ -249,7 +260,7 @@ def main() -> None:
             heading, lines = "## Memory of a map of a million cells", memory()
         else:
             heading = "## A radio map of a street"
-            lines = compare(options.runs, options.threads, options.rays)
+            lines = compare(options.runs, options.threads, options.rays, options.peer_rays)
         if options.write_docs:
             import torch
             from machine import measured_on, write_section

@@ -4,8 +4,8 @@
 
 Runs ``rfsg.tracer.tradeoff`` on the street, on tetam_lab and on the lab with its learned objects, and
 prints a table of each; --write-docs writes docs/tradeoff.md and its pictures, with what
-benchmarks/dial.py has counted, as far as it has. Results are kept in out/tradeoffs by scene and
-settings, so that a second call only prints; --fresh forgets them.
+benchmarks/dial.py and benchmarks/widths.py have found, as far as they have. Results are kept in
+out/tradeoffs by scene and settings, so that a second call only prints; --fresh forgets them.
 """
 
 import argparse
@@ -19,7 +19,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import findings
 import torch
+import widths
 from dial import ROOT, cases, coverage, kept, ladder_table
 from machine import measured_on, write_page
 
@@ -38,44 +40,14 @@ PAGE = ROOT / "docs" / "tradeoff.md"
 
 HEAD = """# Speed against accuracy
 
-Written by `python benchmarks/tradeoffs.py --write-docs` and `benchmarks/dial.py`; for a scene of yours,
-`rfsg tradeoff`. One process of one thread on a machine busy with other work: take times by their order
-of magnitude, and a factor below two for none. Errors are of coherent path gain, against the best setting
-that was affordable (each section names it); *at 90 %* is what nine links of ten keep. *missed* is the
-share of that setting's power in paths that are not found; *from base* what the change alone moves at
-90 % of links. Bold: on the Pareto front.
+Written by `python benchmarks/tradeoffs.py --write-docs`, with what `benchmarks/dial.py` and
+`benchmarks/widths.py` have measured; for a scene of yours, `rfsg tradeoff`. Take times by their order of
+magnitude, and a factor below two for none. Errors are of coherent path gain, against the reference that
+each section names; *at 90 %* is what nine links of ten keep. *missed* is the share of the reference's power
+in paths that are not found; *from base* what the change alone moves at 90 % of links, whatever both lack:
+where the reference is far off, read this one. Bold: on the Pareto front.
 
-What to do with it (the numbers are those of the tables below, unless a finding says otherwise):
-
-1. **Say the accuracy, not the setting.** `--accuracy 1dB` kept its promise on every random scene that was
-   counted ([the dial](#the-dial)). It is careful: in the median a quarter of the estimated error was true.
-   Where a scene needs the top of the ladder, the climb costs more than going there at once.
-2. **The first edge is worth its price, the second rarely.** On the street the first costs some 9 times
-   the time and takes the error from 3.5 to 0.73 dB; in tetam_lab it takes it from 18 to 5.9 dB. The second
-   costs another 50 times for 0.6 dB. `diffraction_depth=1` halves the time of the first for 1.1 dB.
-3. **Bounces among planes are cheap: take five.** On the street five in place of three cost 1.1 to 2.3 times
-   the time, and the worst link goes from 5 dB off to 1. In tetam_lab, among 47 boxes, three bounces are
-   not enough: 5.9 dB at 90 % of links, 19 dB on the worst.
-4. **Never search planes by rays.** Enumeration took 0.66 s for the 688 paths of room.usda at five
-   bounces and two edges, 200,000 rays 24.9 s for the same 688 and the same gains (measured apart from the
-   tables, one thread). `reference` asks for rays (`curved=2`); the dial and `rfsg tradeoff` do not where
-   nothing is curved. On the street 2,000 rays are as quick as enumerating and lose 3 of 936 paths; in
-   the lab 2,000 to 100,000 rays find 122 to 126 of draft's 128, and take up to six times as long.
-5. **Measure learned faces at two rings, no fewer.** `zone_rings=1` halves the time of the lab's draft and
-   moves a link by 2.5 dB; from two to four rings 0.2 dB.
-6. **Longer chains over learned objects are what costs there, and they are weak.** `curved_depth` 3 in
-   place of 1 takes draft from 5.3 to 18 s for 0.2 dB; leaving out reflections on learned objects
-   altogether (`curved=0`) is 4 times quicker and moves 0.07 dB at 2.44 GHz among five of them. What
-   matters of furniture at this wavelength is what goes through it.
-7. **Do not spend on the transport integral.** From 4 to 64 `crossing_samples`, and telescoped against
-   Riemann sums of 16 and 128: 0.001 dB. By 20,000 rays `epsilon` from 1 to 50 mm moves nothing.
-8. **The floor saves no time.** On the street -50 in place of -80 dB drops a third of the paths, takes as
-   long, and moves 0.2 dB; -30 dB moves 0.6. Use it to keep files small.
-9. **Delays converge before gains.** The first arrival is right from the first edge on (52 ns off without,
-   on the street), the delay spread within a nanosecond from `standard` on.
-
-Not on this page: widths and precisions of the network, which are set at training
-([learning.md](learning.md)), and the ways of `intersection`, which `benchmarks/intersect.py` measures.
+What to do with it. Each finding names its tables, and its figures are theirs:
 """
 
 
@@ -110,8 +82,8 @@ def lab() -> Scene:
 
 CASES = (
     Case("street", street, "standard", 240.0, "7 boxes, 20 links at 3.5 GHz"),
-    Case("tetam_lab", offices, "standard", 240.0, "47 boxes, 2 of its sensors, 6 places"),
-    Case("lab", lab, "draft", 330.0, "14 boxes, 5 learned objects, 4 of its receivers"),
+    Case("tetam_lab", offices, "standard", 300.0, "47 boxes, 2 of its sensors, 6 places"),
+    Case("lab", lab, "draft", 360.0, "14 boxes, 5 learned objects, 4 of its receivers"),
 )
 
 
@@ -126,17 +98,20 @@ def main() -> None:
     if options.write_docs and len(chosen) < len(CASES):
         parser.error("--write-docs writes the whole page: leave out --scene")
     start = time.perf_counter()
-    parts = []
+    parts, scenes = [], {}
     for case in chosen:
-        found = measured(case, options.fresh)
+        scenes[case.name] = found = measured(case, options.fresh)
         parts.append(section(case, found))
         print(parts[-1], flush=True)
         if options.write_docs:
             picture = tradeoff_figure(found, f"{case.name}: {case.note}")
             plot.save(picture, PAGE.parent / "images" / f"tradeoff-{case.name}.png")
+    advice = findings.say(findings.Measured(scenes, counted(), widths.kept()))
+    print(advice)
     if options.write_docs:
         line = measured_on(time.perf_counter() - start)
-        write_page(PAGE, HEAD, line, *parts, promise())
+        learned = f"{widths.HEADING}\n\n{widths.section(widths.kept())}"
+        write_page(PAGE, HEAD, advice, line, *parts, learned, promise())
 
 
 def measured(case: Case, fresh: bool = False) -> tradeoff.Tradeoff:
@@ -164,7 +139,7 @@ def measured(case: Case, fresh: bool = False) -> tradeoff.Tradeoff:
 def place(case: Case) -> Path:
     """Where a scene's tradeoff is kept: by its settings and the ladder."""
     rungs = [(r.name, tradeoff.changed(r.quality, Quality())) for r in ladder.RUNGS]
-    grid = [tradeoff.VARIATIONS, tradeoff.INTEGRALS, tradeoff.BY_RAYS]
+    grid = [tradeoff.VARIATIONS, tradeoff.INTEGRALS, tradeoff.BY_RAYS, tradeoff.MEETINGS]
     what = [case.name, case.base, case.budget_s, grid, rungs]
     key = hashlib.sha256(json.dumps(what, sort_keys=True).encode()).hexdigest()[:12]
     return KEPT / f"{case.name}-{key}.json"
@@ -183,14 +158,9 @@ def section(case: Case, found: tradeoff.Tradeoff) -> str:
         cells += [f"{x:.2g}" for x in (*errors, one.error.spread_ns, one.error.arrival_ns)]
         cells += [f"{one.moved_db:.2g}", str(one.paths)]
         rows.append(f"| {' | '.join(cells)} |")
-    told = found.sentence()
     same = [s.split(":")[0] for s in found.left_out if "the same as" in s]
     untried = [s for s in found.left_out if "the same as" not in s]
-    lines = [
-        f"## {case.name}",
-        "",
-        f"{case.note}; varied from `{case.base}`. {told[0].upper()}{told[1:]}.",
-    ]
+    lines = [f"## {case.name}", "", f"{case.note}. {against(case, found)}"]
     lines += ["", f"![error against time](images/tradeoff-{case.name}.png)", "", *rows, ""]
     if same:
         lines += [f"Of no effect on this scene by its make: {'; '.join(same)}.", ""]
@@ -199,9 +169,30 @@ def section(case: Case, found: tradeoff.Tradeoff) -> str:
     return "\n".join(lines)
 
 
+def against(case: Case, found: tradeoff.Tradeoff) -> str:
+    """What is varied and what the errors are against, why that, and what is recommended."""
+    why = "the thorough preset itself"
+    if not found.truth_is_reference:
+        above = [s for s in found.left_out if s.endswith("by the ladder")]
+        why = (
+            f"the most thorough rung of the ladder that fitted into {100 * tradeoff.FOR_TRUTH:.0f} % of "
+            f"{case.budget_s:.0f} s" + "".join(f" (next, {s})" for s in above)
+        )
+    told = f"Single fields are varied from `{case.base}`. Errors are against `{found.reference}`, {why}. "
+    if found.recommended is None:
+        return f"{told}Nothing else is within {found.accuracy_db:g} dB of it at 90 % of links."
+    return f"{told}Recommended for {found.accuracy_db:g} dB: {found.recommended}."
+
+
+def counted() -> list[dict[str, Any]]:
+    """The scenes that benchmarks/dial.py has run so far."""
+    rows = [kept(kind, seed, 1.0) for kind, seed in cases(50, 6, 2)]
+    return [row for row in rows if row is not None]
+
+
 def promise() -> str:
     """What benchmarks/dial.py has counted so far."""
-    rows = [row for kind, seed in cases(50, 6, 2) if (row := kept(kind, seed, 1.0)) is not None]
+    rows = counted()
     if not rows:
         return "## The dial\n\nNot counted yet: run benchmarks/dial.py.\n"
     return f"## The dial\n\n{coverage(rows, 1.0)}\n{ladder_table(rows)}"

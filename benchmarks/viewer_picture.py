@@ -21,7 +21,7 @@ def main() -> None:
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs/images/viewer.png"
     scene = Scene.from_usd(ROOT / "assets/scenes/lab.usda")
     library = Library(ROOT / "assets/objects")
-    session = Session(scene, quality="draft", library=library, map_options={"cell": 0.25})
+    session = Session(scene, quality="standard", library=library, map_options={"cell": 0.25})
     page = Page(session, port=0, title="lab.usda")
     try:
         assert session.wait_for_all(), session.answer

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
@@ -18,15 +17,16 @@ from rfsg.tracer.channel import coefficients
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
+from tests import shipped
 from tests.scenes import radio, room_nodes
+from tests.shipped import ASSETS
 
-ASSETS = Path(__file__).resolve().parents[1] / "assets"
 QUALITY = Quality(depth=2)
 
 
 @pytest.fixture(scope="module")
 def lab() -> Scene:
-    scene = Scene.from_usd(ASSETS / "scenes" / "lab.usda")
+    scene = shipped.lab()
     return scene.with_receivers(scene.receivers[2::9])
 
 
@@ -39,7 +39,7 @@ def test_the_lab_is_what_it_says(lab):
     assert {"/World/Cabinet", "/World/Person", "/World/Desk"} <= {n.path for n in lab.nodes}
     chairs = [n for n in lab.nodes if "Chair" in n.path]
     assert len(chairs) == 2 and chairs[0].body is chairs[1].body
-    assert len(Scene.from_usd(ASSETS / "scenes" / "lab.usda").receivers) >= 20
+    assert len(shipped.lab().receivers) >= 20
     assert sum(not n.body.shape.exact for n in lab.nodes) == 5
 
 
@@ -62,7 +62,7 @@ def test_reciprocity_of_the_lab(lab, result):
 
 def test_neural_cabinet_against_the_box_it_was_learned_from():
     """Same known material: delays within 0.05 ns, reflections within 0.5 dB, one path per mirror."""
-    cabinet = load_asset(ASSETS / "objects" / "cabinet" / "cabinet.usda").body
+    cabinet = shipped.shape("cabinet")
     # the mesh (assets/sources): body x +-0.225, y +-0.45, z 0.06 to 1.40, on a plinth set back 4 cm
     box = Body(Box([0.225, 0.45, 0.67]), Conductor())
     walls = room_nodes((5.0, 4.0, 3.0))
@@ -71,7 +71,7 @@ def test_neural_cabinet_against_the_box_it_was_learned_from():
     tx = (radio("/t", 3.6, 3.1, 1.3),)
     found = []
     for node in (
-        Node("/c", Body(cabinet.shape, Conductor()), Pose.at(1.2, 1.9, 0.005, 10.0)),
+        Node("/c", Body(cabinet, Conductor()), Pose.at(1.2, 1.9, 0.005, 10.0)),
         Node("/c", box, Pose.at(1.2, 1.9, 0.735, 10.0)),
     ):
         result = simulate(Scene((*walls, node), tx, rx, 2.44e9), quality=QUALITY)

@@ -22,12 +22,13 @@ from rfsg.cli.options import (
     Variants,
 )
 from rfsg.cli.parse import parse_quality
-from rfsg.cli.scenes import Edits, edit, read_scene
+from rfsg.cli.scenes import Edits, edit, must_exist, reading_options
 
 if TYPE_CHECKING:
     from rfsg.view.session import Session
 
 PORT = 8080
+LOOK_S = 1.0  # between looks at whether another program has written the scene's files
 
 
 def view(
@@ -70,7 +71,8 @@ def view(
     """Look at a scene and its paths in the browser, and move, swap, copy and remove things.
 
     The page is served to this machine alone (127.0.0.1). While something is dragged its paths follow
-    as a draft; at rest they are those of `rfsg simulate`. Needs: pip install rfsg[viewer]
+    as a draft; at rest they are those of `rfsg simulate`. What another program writes to the scene's
+    files is taken over. Needs: pip install rfsg[viewer]
 
     Example: rfsg view lab.usda --library objects --map --save moved.usda
     """
@@ -79,10 +81,14 @@ def view(
     for name, file in (("--save", save), ("--html", html)):
         if file is not None and file.exists() and not overwrite:
             raise typer.BadParameter(f"{name} {file}: already exists; --overwrite replaces it")
-    read = read_scene(scene, asset_root, variant, time)
-    edited = edit(read, Edits(move, swap, remove, add), receivers)
+    must_exist(scene)
+    options = reading_options(asset_root, variant, time)
     from rfsg.scene.library import Library
+    from rfsg.scene.usd.live import LiveScene
     from rfsg.view.session import Session
+
+    live = LiveScene(scene, **options)
+    edited = edit(live.scene, Edits(move, swap, remove, add), receivers)
 
     session = Session(
         edited,
@@ -92,6 +98,7 @@ def view(
         save_to=save,
         overwrite=overwrite,
         map_options={"height": height} if map_ else None,
+        live=live,
     )
     try:
         if html is None:
@@ -115,7 +122,8 @@ def _serve(session: "Session", port: int, title: str, open_: bool) -> None:
         webbrowser.open(page.url)
     try:
         while True:
-            clock.sleep(3600.0)
+            clock.sleep(LOOK_S)
+            page.refresh()
     except KeyboardInterrupt:
         typer.echo("")
     finally:

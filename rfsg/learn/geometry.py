@@ -41,6 +41,7 @@ MAX_BYTES = 512 * 2**20
 MAX_TRIANGLES = 5_000_000
 MARGIN, LEAST_MARGIN = 0.05, 0.03  # bounds beyond the mesh: share of its size, or metres if more
 STEPS = 6_000
+WIDTH = 64  # of the hidden layers: the paper's
 NEAR_BATCH, FAR_BATCH = 512, 256  # smaller batches and more steps learned better per second
 NEAR_POOL, FAR_POOL = 100_000, 50_000
 CHECKPOINT_EVERY = 200
@@ -133,22 +134,25 @@ def learn_shape(
     *,
     seed: int = 0,
     steps: int = STEPS,
+    width: int = WIDTH,
     checkpoint: Path | None = None,
     resume: bool = True,
     progress: Progress | None = None,
 ) -> tuple[NeuralShape, Report]:
     """Learn a watertight mesh [m]: the shape, and how well it was learned.
 
+    width: of the network's hidden layers; what more of it costs and buys stands in docs/tradeoff.md.
     checkpoint: file to write every few hundred steps and, with ``resume``, to continue from; the
     result is that of an uninterrupted run, because each step draws its batch from (seed, step).
     Raises LearnError for a checkpoint of another training, or when the learned surface reaches the
     bounds (too few steps).
     """
-    if steps < 1:
-        raise LearnError(f"steps={steps}: expected at least 1")
+    for name, number in (("steps", steps), ("width", width)):
+        if number < 1:
+            raise LearnError(f"{name}={number}: expected at least 1")
     began = time.monotonic()
     distance = MeshDistance(mesh)
-    training = _Training(distance, seed, steps)
+    training = _Training(distance, seed, steps, width)
     if checkpoint is not None and resume and checkpoint.exists():
         training.load(checkpoint)
     for step in range(training.done, steps):
@@ -365,17 +369,17 @@ class _Training:
     RATE, WARM_UP, LAST_RATE = 3e-3, 50, 0.01
     GRADIENT, EIKONAL, FAR = 0.1, 0.01, 0.2  # weights of the terms; that of the near values is 1
 
-    def __init__(self, distance: MeshDistance, seed: int, steps: int):
+    def __init__(self, distance: MeshDistance, seed: int, steps: int, width: int = WIDTH):
         self.seed, self.steps, self.done, self.seconds_before = seed, steps, 0, 0.0
         self.size = distance.size
         mesh = distance.mesh
         margin = max(MARGIN * self.size, LEAST_MARGIN)
         bounds = torch.from_numpy(np.array([mesh.bounds[0] - margin, mesh.bounds[1] + margin]))
-        self.shape = NeuralShape(bounds, lipschitz=1.0, seed=seed)
+        self.shape = NeuralShape(bounds, width=width, lipschitz=1.0, seed=seed)
         learned = [*self.shape.hidden.parameters(), *self.shape.to_value.parameters()]
         self.optimiser = Soap(learned)
         self.near, self.far = _pools(distance, bounds, seed)
-        self.job = {"mesh": _fingerprint(mesh), "seed": seed, "steps": steps}
+        self.job = {"mesh": _fingerprint(mesh), "seed": seed, "steps": steps, "width": width}
 
     def step(self, step: int) -> float:
         """One step; returns the mean |f| error of its near points [m]."""
@@ -425,7 +429,7 @@ class _Training:
             raise LearnError(f"{path}: not a checkpoint that can be read ({error})") from error
         if not isinstance(state, dict) or any(state.get(k) != v for k, v in self.job.items()):
             raise LearnError(
-                f"{path}: checkpoint of another training (mesh, seed or steps differ): "
+                f"{path}: checkpoint of another training (mesh, seed, steps or width differ): "
                 "delete it, or begin anew with resume=False"
             )
         self.shape.load_state_dict(_under("shape.", tensors))

@@ -1,5 +1,8 @@
 """Body(shape, surface): the one concrete RadioObject."""
 
+from typing import Any
+
+import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
@@ -47,3 +50,12 @@ class Body(nn.Module):
         self, crossing: Crossing, frequency: Float[Tensor, "f"]
     ) -> Float[Tensor, "*b f"]:
         return self.surface.excess_delay(self.shape, crossing, frequency)
+
+
+def unstretched(body: Body) -> tuple[Body, Float[Tensor, "3"]]:
+    """The body as it was learned, and the scales along the axes of its frame: 1, but for one whose
+    shape is ``shapes.stretched.Stretched``."""
+    shape: Any = body.shape
+    if shape.kind != "stretched":
+        return body, torch.ones(3, dtype=torch.float64)
+    return Body(shape.base, body.surface, body.band), shape.scales

@@ -5,10 +5,11 @@ the weights that it has now, in its own frame; place, size and motion stay with 
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rfsg.objects.body import Body
+from rfsg.objects.body import Body, unstretched
 from rfsg.objects.shapes.shown import Shown, hull_of, shown_mesh
 from rfsg.scene.assets import LoadedAsset, load_asset
 from rfsg.scene.errors import SceneError
@@ -42,6 +43,7 @@ def export(
     written, and files that are there unless ``overwrite``.
     """
     node, out, file = scene.node(path), Path(out), usd_file(out)
+    node = replace(node, body=unstretched(node.body)[0])
     refuse_overwrite([file], overwrite)  # before the work
     shown = surface_of(node) if mesh is None else mesh
     files = asset_files(
@@ -72,9 +74,10 @@ def usd_file(out: str | Path) -> Path:
 
 
 def surface_of(node: Node) -> Shown:
-    """The mesh that is shown of a node's object. SceneError where there is none."""
+    """The mesh that an asset shows of a node's object, as it was learned. SceneError where there is
+    none."""
     try:
-        return shown_mesh(node.body.shape)
+        return shown_mesh(unstretched(node.body)[0].shape)
     except ValueError as error:
         raise SceneError([f"{node.path}: no asset can be made of it: {error}"]) from error
 

@@ -27,6 +27,11 @@ class Placement:
     translation: Float64[ndarray, "3"]
     scales: Float64[ndarray, "3"]
 
+    @property
+    def even(self) -> bool:
+        """Whether all axes are scaled alike."""
+        return bool(np.ptp(self.scales) <= TOLERANCE * self.scales.max())
+
     def uniform(self, *axes: int) -> float:
         """The common scale of the given axes (all by default); ValueError if they differ."""
         scales = self.scales[list(axes)] if axes else self.scales

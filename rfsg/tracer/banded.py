@@ -1,9 +1,11 @@
-"""Marching a learned shape on what was baked of it: the network is asked only next to the surface.
+"""Marching a learned shape some steps at a time, on what was baked of it or by the network alone.
 
-The steps are those of the plain march, |f| / L and not below the floor, but |f| is first bounded from
-the baked grid: where its value exceeds its doubt the sign is known, and the bound is what is left. A
-cell at whose two ends, on the ray, it does so by more than the values bend between is crossed at once.
-Elsewhere, a fraction of a millimetre from the surface, the network answers.
+The steps are those of the plain march, |f| / L and not below the floor. On what was baked the network
+is asked only next to the surface: |f| is first bounded from the baked grid, and where its value exceeds
+its doubt the sign is known, and the bound is what is left. A cell at whose two ends, on the ray, it does
+so by more than the values bend between is crossed at once. Elsewhere, a fraction of a millimetre from
+the surface, the network answers. Without anything baked it answers everywhere. Either way a few rays
+look several least steps ahead, as a call costs more than the points in it.
 """
 
 from dataclasses import dataclass
@@ -15,7 +17,8 @@ from torch import Tensor
 from rfsg.objects.contract import Shape
 from rfsg.objects.shapes.band import Baked
 
-AT_ONCE = 2_048  # points asked of the network at once: a few rays look several least steps ahead
+AT_ONCE = 2_048  # points looked at at once, of which the network is asked a part
+ASKED_AT_ONCE = 256  # the same where it is asked of all: as many again cost as much as a call
 DOUBLED = 4  # steps after which those left look twice as far ahead, once most have arrived
 MOST_AHEAD = 32
 WIDER = 2e-6  # [m] more than float32 rounds a length of 10 m by
@@ -39,7 +42,7 @@ class Brackets:
 
 def bracketed(
     shape: Shape,
-    baked: Baked,
+    baked: Baked | None,
     start: Float[Tensor, "m 3"],
     direction: Float[Tensor, "m 3"],
     end: Float[Tensor, "m"],
@@ -54,22 +57,23 @@ def bracketed(
     """
     start, direction, end = start.float(), direction.float(), end.float()
     count = torch.zeros(len(end), dtype=torch.int64, device=end.device)
-    value, bound, way = signed(shape, baked, start, direction)
+    at_once = ASKED_AT_ONCE if baked is None else AT_ONCE
+    value, reach = signed(shape, baked, start, direction)
     inside = value < 0
     found: list[tuple[Tensor, ...]] = []
     row = torch.nonzero(end > 0).squeeze(-1)
-    state = _take((start, direction, end, torch.zeros_like(end), value, bound, way), row)
+    state = _take((start, direction, end, torch.zeros_like(end), value, reach), row)
     steps = 0
     while len(row):
-        p0, d, last, t, value, bound, way = state
-        first = t + torch.maximum(_step(baked, bound), way).clamp_(min=floor)
-        more = ahead * 2 ** max(steps // DOUBLED - 2, 0) or max(AT_ONCE // len(row), 1)
+        p0, d, last, t, value, reach = state
+        first = t + reach.clamp(min=floor)
+        more = ahead * 2 ** max(steps // DOUBLED - 2, 0) or max(at_once // len(row), 1)
         more, steps = min(more, MOST_AHEAD), steps + 1
         along = first[:, None] + floor * torch.arange(more, device=t.device)
         along = torch.minimum(along, last[:, None])
         point = torch.addcmul(p0[:, None], along[..., None], d[:, None])
         looked = signed(shape, baked, point.view(-1, 3), d.repeat_interleave(more, 0))
-        there, bounds, ways = (x.view(along.shape) for x in looked)
+        there, reaches = (x.view(along.shape) for x in looked)
         t, value = torch.cat([t[:, None], along], 1), torch.cat([value[:, None], there], 1)
         flip = (value[:, 1:] < 0) != (value[:, :-1] < 0)
         i, k = torch.nonzero(flip, as_tuple=True)
@@ -80,7 +84,7 @@ def bracketed(
             count[row] = (count[row] + flip.sum(1)).clamp_(max=most)
         going = (t[:, -1] < last) & (count[row] < most)
         last = torch.where(going, last, t[:, -1])  # a ray that is done rests where it is
-        state = (p0, d, last, t[:, -1], value[:, -1], bounds[:, -1], ways[:, -1])
+        state = (p0, d, last, t[:, -1], value[:, -1], reaches[:, -1])
         moving = torch.nonzero(going).squeeze(-1)
         if len(moving) <= RESTING * len(row):
             row, state = row[moving], _take(state, moving)
@@ -92,21 +96,24 @@ def bracketed(
 
 
 def signed(
-    shape: Shape, baked: Baked, point: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"]
-) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"], Float[Tensor, "m"]]:
-    """(value, bound, way): f or about it, never of the wrong sign, a lower bound of |f| [m], and how far
-    the baked values say that it keeps its sign along the direction [m]."""
+    shape: Shape, baked: Baked | None, point: Float[Tensor, "m 3"], direction: Float[Tensor, "m 3"]
+) -> tuple[Float[Tensor, "m"], Float[Tensor, "m"]]:
+    """(value, reach): f or about it, never of the wrong sign, and how far f certainly keeps its sign
+    along the direction [m]."""
+    if baked is None:
+        value = shape.sdf(point)
+        return value, value.abs() / shape.lipschitz
     value, doubt, way = baked.look_ahead(point, direction)
     bound = value.abs() - doubt
     near = torch.nonzero(bound <= 0).squeeze(-1)
     if len(near):
         exact = shape.sdf(point[near])
         value[near], bound[near] = exact, exact.abs()
-    return value, bound, way
+    return value, torch.maximum(_step(baked, bound), way)
 
 
 def _step(baked: Baked, bound: Tensor) -> Tensor:
-    """How far f certainly keeps its sign [m]: slower in the band near the surface than elsewhere."""
+    """How far f keeps its sign by its lower bound [m]: slower in the band near the surface."""
     near = bound.clamp(max=baked.margin)
     return near / baked.slope + (bound - near) / max(baked.lipschitz, baked.slope)
 

@@ -20,6 +20,7 @@ eps' >= 1 and eps'' >= 0.
   the middle of a short interval bounds it in the interval.
 """
 
+import json
 import math
 from dataclasses import dataclass
 
@@ -29,6 +30,7 @@ from torch import Tensor
 
 from rfsg.objects.body import Body
 from rfsg.objects.physics import fresnel
+from rfsg.objects.recent import Recent
 from rfsg.objects.surfaces.interface import DielectricHalfSpace, Known
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.solid import Solid
@@ -94,7 +96,7 @@ class Floor:
     ):
         self.planes, self.corners = planes, planes.corners()
         self.surface = world.surface_of_node[planes.node]
-        bodies = [most_reflected(body, frequency) for body in world.surfaces]
+        bodies = [_most_reflected(body, frequency) for body in world.surfaces]
         self.most = torch.stack(bodies).to(world.device) if bodies else torch.ones(0, CELLS)
         self.least = least_product(world, quality)
         self.pruned = 0
@@ -145,6 +147,19 @@ def _least_cosine(
     """The least |cos| between normals and any direction in the cone of four; 0 if it crosses a plane."""
     along = normal @ direction.mT
     return torch.maximum(along.amin(-1), -along.amax(-1)).clamp(min=0.0)
+
+
+MOST_CACHED = 1024  # tables of ``CELLS`` numbers
+_MOST: Recent[Tensor] = Recent(MOST_CACHED)
+
+
+def _most_reflected(body: Body, frequency: Float[Tensor, "f"]) -> Float[Tensor, "cells"]:
+    """``most_reflected``, kept by the constants of the material: a scene asks again after every edit."""
+    if not isinstance(body.surface, Known):
+        return most_reflected(body, frequency)
+    constants = json.dumps(body.surface.config(), sort_keys=True)
+    key = (body.surface.kind, constants, tuple(frequency.tolist()), str(frequency.device))
+    return _MOST.get(key, None, lambda: most_reflected(body, frequency))
 
 
 @torch.no_grad()

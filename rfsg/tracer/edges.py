@@ -13,6 +13,8 @@ from rfsg.scene.world import World, unit
 LEAST = 1.0  # [wavelengths] length of an edge that diffracts
 LOOKS = 9  # places along an edge at which to see whether anything of it is free
 ACROSS = (0.01, 0.25, 0.5, 0.75, 0.99)  # of the exterior angle: where the wedge must be free
+PAIRS = 1 << 19  # (point, node) tests at a time: bounds memory
+WIDER = 1e-9  # by so much [m, and of its size] is an upright box wider than what it holds
 NEARBY = (5e-2, 5e-5)  # wavelengths: what is closer than this to a wedge is part of it
 
 
@@ -183,11 +185,30 @@ def is_free(
 def _inside_another(world: World, node: Tensor, point: Tensor) -> Bool[Tensor, "m"]:
     """Points inside an object other than their own."""
     inside = torch.zeros(len(point), dtype=torch.bool, device=point.device)
-    for k in range(len(world)):
-        # one frame for all: a gather of frames would cost more than the test
-        local = (point - world.translation[k]) @ world.rotation[k] / world.scale[k]
-        low, high = world.bounds_object[k]
-        i = torch.nonzero(((local > low) & (local < high)).all(-1) & (node != k)).squeeze(-1)
-        if len(i):
-            inside[i] |= world.sdf(torch.full_like(i, k), point[i]) < 0
+    low, high = upright(world, torch.arange(len(world), device=node.device))
+    for i in torch.arange(len(point), device=node.device).split(max(1, PAIRS // max(1, len(low)))):
+        near = node[i, None] != torch.arange(len(low), device=node.device)
+        for axis in range(3):
+            place = point[i, axis, None]
+            near &= (place > low[:, axis]) & (place < high[:, axis])
+        row, which = torch.nonzero(near, as_tuple=True)
+        row = i[row]
+        local = world.point_object(which, point[row])
+        bounds = world.bounds_object[which]
+        held = ((local > bounds[:, 0]) & (local < bounds[:, 1])).all(-1)
+        row, which = row[held], which[held]
+        inside[row[world.sdf(which, point[row]) < 0]] = True
     return inside
+
+
+def upright(world: World, which: Int[Tensor, "k"]) -> tuple[Float[Tensor, "k 3"], Tensor]:
+    """Lowest and highest corners, in the world, of nodes' bounds; infinite where those are."""
+    low, high = world.bounds_object[which].detach().unbind(1)
+    bounded = (torch.isfinite(low) & torch.isfinite(high)).all(-1)[:, None]
+    middle = torch.where(bounded, 0.5 * (low + high), 0.0)
+    half = torch.where(bounded, 0.5 * (high - low), 0.0)
+    centre = world.point_world(which, middle).detach()
+    turned = torch.einsum("nij,nj->ni", world.rotation[which].detach().abs(), half)
+    reach = turned * world.scale[which, None].detach() * (1 + WIDER) + WIDER
+    reach = torch.where(bounded, reach, torch.inf)
+    return centre - reach, centre + reach

@@ -14,6 +14,7 @@ from torch import Tensor
 from rfsg.objects.body import Body
 from rfsg.objects.contract import Shape
 from rfsg.objects.recent import Recent
+from rfsg.objects.shapes.analytic import Box
 from rfsg.objects.shapes.kept import state_of
 from rfsg.objects.surfaces.interface import Conductor
 from rfsg.scene.pose import Pose
@@ -96,27 +97,49 @@ def planes_of(world: World) -> Planes:
 
 def moving_planes_of(world: World) -> Planes:
     """The same, differentiable in poses and sizes."""
-    shapes = {id(n.body.shape): n.body.shape for n in world.scene.nodes}
-    tables = {key: _rectangles(shape) for key, shape in shapes.items()}
-    rows = [tables[id(n.body.shape)] for n in world.scene.nodes]
-    each = [torch.arange(len(table[0]), device=world.device) for table in rows]
-    node = torch.arange(len(rows), device=world.device)
-    node = node.repeat_interleave(torch.tensor([len(t) for t in each], dtype=torch.int64).to(node))
+    own = [n.body.shape for n in world.scene.nodes]
+    shapes = {id(shape): shape for shape in own}
+    number = {key: k for k, key in enumerate(shapes)}
+    owner = torch.tensor([number[id(shape)] for shape in own], dtype=torch.int64).to(world.device)
+    boxes = _box_rectangles(shapes)
+    tables = [boxes[k] if k in boxes else _rectangles(s) for k, s in shapes.items()]
     zero = world.translation.new_zeros
     blank = (zero(0, 4), zero(0, 3), zero(0, 2, 3), zero(0, 2))
-    columns = zip(blank, *rows, strict=True)
-    plane, centre, edges, half = (torch.cat([x.to(zero(0)) for x in c]) for c in columns)
+    columns = [torch.cat([x.to(zero(0)) for x in c]) for c in zip(blank, *tables, strict=True)]
+    # each shape's faces stand once in the columns, and are looked up for every node that has it
+    count = torch.tensor([len(table[0]) for table in tables], dtype=torch.int64).to(world.device)
+    many = count[owner]
+    node = torch.arange(len(own), device=world.device).repeat_interleave(many)
+    patch = torch.arange(len(node), device=world.device) - (torch.cumsum(many, 0) - many)[node]
+    row = (torch.cumsum(count, 0) - count)[owner[node]] + patch
+    plane, centre, edges, half = (column[row] for column in columns)
     normal = world.direction_world(node, plane[:, :3])
     place = (normal * world.translation[node]).sum(-1)
     return Planes(
         node,
-        torch.cat([node[:0], *each]),
+        patch,
         normal,
         plane[:, 3] * world.scale[node] + place,
         world.point_world(node, centre),
         torch.stack([world.direction_world(node, edges[:, k]) for k in (0, 1)], 1),
         half * world.scale[node, None],
     )
+
+
+def _box_rectangles(shapes: dict[int, Shape]) -> dict[int, tuple[Tensor, ...]]:
+    """``_rectangles`` of all boxes at once: a scene may have hundreds, each with a size of its own."""
+    boxes = {key: shape for key, shape in shapes.items() if type(shape) is Box}
+    if not boxes:
+        return {}
+    half = torch.stack([box.half_size for box in boxes.values()])
+    axis = torch.arange(3, device=half.device).repeat_interleave(2)
+    eye = torch.eye(3, dtype=half.dtype, device=half.device)
+    normal = torch.stack([-eye, eye], 1).reshape(6, 3).expand(len(half), 6, 3)
+    offset = half[:, axis, None]
+    others = torch.tensor([[1, 2], [0, 2], [0, 1]], device=half.device)[axis]
+    edges = eye[others].expand(len(half), 6, 2, 3)
+    columns = (torch.cat([normal, offset], 2), offset * normal, edges, half[:, others])
+    return dict(zip(boxes, zip(*columns, strict=True), strict=True))
 
 
 def _rectangles(shape: Shape) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -142,7 +165,8 @@ def samples_of(world: World) -> list[Samples]:
     """Sampled faces of every shape that has curved or learned ones: once for all nodes that have it."""
     nodes_of: dict[int, list[int]] = {}
     for node, item in enumerate(world.scene.nodes):
-        nodes_of.setdefault(id(item.body.shape), []).append(node)
+        if not item.body.shape.faceted:
+            nodes_of.setdefault(id(item.body.shape), []).append(node)
     out = []
     for nodes in nodes_of.values():
         found = _sampled(world.scene.nodes[nodes[0]].body.shape, world.device)

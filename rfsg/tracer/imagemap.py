@@ -9,6 +9,7 @@ those that go through something, are left to the path solver's own tracing.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -31,8 +32,10 @@ from rfsg.tracer.seams import coincident
 from rfsg.tracer.sequences import MOST_PAIRS
 from rfsg.tracer.settle import ON_SURFACE
 from rfsg.tracer.solve import COINCIDENT, GRAZING
+from rfsg.tracer.traced import in_threads
 
 HAIR = 1e-3  # [m] nearer to a face than this, the path solver's own rules decide, in float64
+AT_ONCE = 16  # batches of lines among threads
 STILL = 1e-12  # [m] along an axis: such a segment is beside a box, or between its faces, as a whole
 
 
@@ -76,12 +79,22 @@ def power_by_images(
             ["map by images: too many sequences of faces; take fewer reflections, or 'rays'"]
         ) from None
     dark = search.within_opaque()
-    for t, sequences in enumerate(found):
-        for some in sequences:
-            for lit in lit_by(search.planes, some, rows, quality.chunk):
-                i = torch.nonzero(~dark[lit.point]).squeeze(-1)
-                here, power = search.heard(t, some, Lit(lit.sequence[i], lit.point[i]))
-                gain[t].index_add_(0, here, power)
+    batches = (
+        (t, some, lit)
+        for t, sequences in enumerate(found)
+        for some in sequences
+        for lit in lit_by(search.planes, some, rows, quality.chunk)
+    )
+
+    def work(batch: tuple[int, Prefixes, Lit]) -> tuple[Tensor, Tensor]:
+        t, some, lit = batch
+        i = torch.nonzero(~dark[lit.point]).squeeze(-1)
+        return search.heard(t, some, Lit(lit.sequence[i], lit.point[i]))
+
+    # a few batches at a time, for memory; added in their order, so that threads change nothing
+    while now := list(islice(batches, AT_ONCE)):
+        for (t, *_), (here, power) in zip(now, in_threads(work, now), strict=True):
+            gain[t].index_add_(0, here, power)
     return gain
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rfsg.scene.world import FLUSH, World
 from rfsg.tracer.columns import Columns, columns, dot, moved
-from rfsg.tracer.edges import NEARBY, Edges, stands_free
+from rfsg.tracer.edges import NEARBY, Edges, stands_free, upright
 from rfsg.tracer.embree import brute_spans
 from rfsg.tracer.implicit import segments
 from rfsg.tracer.kept import Since
@@ -34,7 +34,7 @@ def crosses(
     origin, direction = columns(rays.origin), columns(rays.direction)
     for world, nodes in places:
         for node in torch.nonzero(nodes).squeeze(-1):
-            low, high = (x[0] for x in _upright(world, node[None]))
+            low, high = (x[0] for x in upright(world, node[None]))
             centre, radius = 0.5 * (low + high), 0.5 * float((high - low).norm())
             near = torch.nonzero(_beside(origin, direction, rays.limit, centre, radius))
             for i in near.squeeze(-1).split(BLOCK):
@@ -109,22 +109,10 @@ def _near(edges: Edges, world: World, nodes: Bool[Tensor, "n"], reach: float) ->
     start = torch.where(straight, edges.start, edges.centre)
     low = torch.minimum(start, end) - around - reach * ROUNDING
     high = torch.maximum(start, end) + around + reach * ROUNDING
-    node_low, node_high = _upright(world, which)
+    node_low, node_high = upright(world, which)
     for k in range(len(which)):
         near |= ((low <= node_high[k]) & (high >= node_low[k])).all(1)
     return near
 
 
 ROUNDING = 1.01  # wider by so much than what is looked at
-
-
-def _upright(world: World, which: Int[Tensor, "k"]) -> tuple[Float[Tensor, "k 3"], Tensor]:
-    """Lowest and highest corners, in the world, of nodes' bounds; infinite where those are."""
-    low, high = world.bounds_object[which].detach().unbind(1)
-    bounded = (torch.isfinite(low) & torch.isfinite(high)).all(-1)[:, None]
-    middle = torch.where(bounded, 0.5 * (low + high), 0.0)
-    half = torch.where(bounded, 0.5 * (high - low), 0.0)
-    centre = world.point_world(which, middle).detach()
-    turned = torch.einsum("nij,nj->ni", world.rotation[which].detach().abs(), half)
-    reach = torch.where(bounded, turned * world.scale[which, None].detach(), torch.inf)
-    return centre - reach, centre + reach

@@ -16,7 +16,7 @@ from rfsg.objects.shapes.kept import baked_if_it_pays
 from rfsg.scene.world import World
 from rfsg.tracer.embree import sort_by
 from rfsg.tracer.records import Crossings, Rays, Spans
-from rfsg.tracer.roots import baked_roots
+from rfsg.tracer.roots import roots_on
 from rfsg.tracer.seams import ASIDE, along_seams
 
 MOST_ROOTS = 16  # boundaries of one object on one ray; a chair's back has about ten
@@ -171,16 +171,17 @@ def march(
 
     A shape that is not convex may say them in closed form. Else steps are max(|f| / L, step_floor):
     with L a true bound none skips anything thicker than the floor. A network that many rays have met
-    is baked, and then asked only near its surface.
+    is baked, and then asked only near its surface. In float64 nothing is looked ahead: what is found on
+    a path does not depend on the others.
     """
     own = getattr(shape, "stretches", None)
     if own is not None and not shape.convex:
         return own(start, direction, length)
     baked = baked_if_it_pays(shape, options.rays)
-    if baked is None:
+    if baked is None and options.dtype == torch.float64:
         return plain_march(shape, start, direction, length, options)
     p0, d, end = (x.to(options.dtype) for x in (start, direction, length))
-    found = baked_roots(
+    found = roots_on(
         shape,
         baked,
         p0,

@@ -14,15 +14,16 @@ Where diffuse reflection is followed, a rough surface sends on a second ray in a
 its lobe, with the diffuse share of the power (``draw``: one of the two, by their powers). A ray scatters
 once, like a path of the solver; so at a depth of 2 the two hold the same orders.
 
-The lattice is shot in several turned copies; their scatter is the reported standard error.
+The lattice is shot in several turned copies; their scatter is the reported standard error. Copies fly
+together, as many as asked for: each draws from a generator of its own, so company changes nothing.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from rfsg.objects.contract import Contact
@@ -48,14 +49,27 @@ MEETINGS = 1_000_000  # of rays and receivers looked at at a time
 
 
 @dataclass(frozen=True)
+class Lattice:
+    """A turned copy of the lattice about a transmitter; all else that is random of it is drawn from the
+    generator."""
+
+    transmitter: Radio
+    position: Float[Tensor, "3"]
+    turn: Float[Tensor, "3 3"]
+    generator: torch.Generator
+
+
+@dataclass(frozen=True)
 class Flight:
     """Rays of one bounce level and what they meet: collect along ``rays`` up to ``end`` [m].
 
-    ``weight`` [r] is the power at the start, in shares of the transmitter's; ``toll`` [m] the loss
-    -ln |T|^2 (with the draw's 1/p) of each crossing, paid where it is left.
+    ``lattice`` [r] is the copy that each ray belongs to, ``weight`` [r] the power at the start, in
+    shares of the transmitter's; ``toll`` [m] the loss -ln |T|^2 (with the draw's 1/p) of each crossing,
+    paid where it is left.
     """
 
     rays: Rays
+    lattice: Int[Tensor, "r"]
     weight: Float[Tensor, "r"]
     end: Float[Tensor, "r"]
     inside: Crossings
@@ -79,44 +93,73 @@ class Flight:
         return torch.where(alive, self.weight[ray] * torch.exp(-paid), torch.zeros_like(paid))
 
 
+@dataclass(frozen=True)
+class _Sent:
+    """Rays under way: their lattice, their power, and whether they have yet to scatter (``fresh``)."""
+
+    rays: Rays
+    lattice: Int[Tensor, "r"]
+    weight: Float[Tensor, "r"]
+    fresh: Bool[Tensor, "r"]
+
+    def none(self) -> "_Sent":
+        """None of them."""
+        return _Sent(self.rays.take(slice(0)), self.lattice[:0], self.weight[:0], self.fresh[:0])
+
+
 @torch.no_grad()
 def flights(
     world: World,
     proxies: Proxies,
-    transmitter: Radio,
-    position: Float[Tensor, "3"],
+    lattices: Sequence[Lattice],
     frequency: Float[Tensor, "1"],
     quality: Quality,
     branching: str,
-    generator: torch.Generator,
 ) -> Iterator[Flight]:
-    """The flights of one turned copy of the lattice, bounce level by bounce level; a generator of
-    which the turn and all else that is random are drawn."""
+    """The flights of some turned copies of the lattice together, bounce level by bounce level."""
     if branching not in ("enumerate", "draw"):
         raise ValueError(f"branching {branching!r}: expected 'enumerate' or 'draw'")
-    per_copy = per_round(quality)
-    direction = fibonacci(per_copy, world.device) @ _turn(generator).to(world.device)
-    pattern = amplitude(transmitter, direction @ transmitter.rotation.to(direction))
-    rays = Rays(
-        position.expand(per_copy, 3).clone(),
-        direction,
-        torch.full((per_copy,), torch.inf, dtype=torch.float64, device=world.device),
-    )
-    weight = pattern**2 / per_copy
-    fresh = torch.full_like(weight, quality.diffuse > 0, dtype=torch.bool)
+    generators = [lattice.generator for lattice in lattices]
+    sent = _launched(lattices, quality, world.device)
     for level in range(quality.depth + 1):
-        flight, reflected = _fly(
-            world, proxies, rays, weight, fresh, frequency, quality, branching, generator
-        )
+        last = level == quality.depth
+        flight, sent = _fly(world, proxies, sent, frequency, quality, branching, generators, last)
         yield flight
-        if level == quality.depth or reflected is None:
+        if not len(sent.weight):
             break
-        rays, weight, fresh = reflected
+
+
+def _launched(lattices: Sequence[Lattice], quality: Quality, device: torch.device) -> _Sent:
+    """The rays of all lattices, those of one after those of another."""
+    count = per_round(quality)
+    even = fibonacci(count, device)
+    turned = [even @ lattice.turn.to(device) for lattice in lattices]
+    patterns = [
+        amplitude(lattice.transmitter, d @ lattice.transmitter.rotation.to(d))
+        for lattice, d in zip(lattices, turned, strict=True)
+    ]
+    direction, weight = torch.cat(turned), torch.cat(patterns) ** 2 / count
+    which = torch.arange(len(lattices), device=device).repeat_interleave(count)
+    origin = torch.stack([lattice.position for lattice in lattices])[which]
+    endless = torch.full_like(weight, torch.inf)
+    fresh = torch.full_like(which, quality.diffuse > 0, dtype=torch.bool)
+    return _Sent(Rays(origin, direction, endless), which, weight, fresh)
 
 
 def per_round(quality: Quality) -> int:
     """Rays of one turned copy of the lattice."""
     return max(1, quality.map_rays // COPIES)
+
+
+class Draws:
+    """Turns and generators of copies, one after the other: those of the n-th hang on the seed alone."""
+
+    def __init__(self, seed: int):
+        self._turns, self._seeds = (torch.Generator().manual_seed(seed) for _ in range(2))
+
+    def next(self) -> tuple[Float[Tensor, "3 3"], torch.Generator]:
+        seed = int(torch.randint(2**62, (1,), generator=self._seeds))
+        return _turn(self._turns), torch.Generator().manual_seed(seed)
 
 
 def _turn(generator: torch.Generator) -> Tensor:
@@ -125,31 +168,46 @@ def _turn(generator: torch.Generator) -> Tensor:
     return q * torch.sign(torch.diagonal(r))
 
 
+def _uniform(
+    lattice: Int[Tensor, "k"], generators: Sequence[torch.Generator], columns: int
+) -> Float[Tensor, "k columns"]:
+    """Numbers between 0 and 1, each drawn from the generator of the lattice that asks for it."""
+    drawn = torch.empty(len(lattice), columns, dtype=torch.float64, device=lattice.device)
+    for number, generator in enumerate(generators):
+        i = torch.nonzero(lattice == number).squeeze(-1)
+        drawn[i] = torch.rand(len(i), columns, dtype=torch.float64, generator=generator).to(drawn)
+    return drawn
+
+
 def _fly(
     world: World,
     proxies: Proxies,
-    rays: Rays,
-    weight: Tensor,
-    fresh: Tensor,
+    sent: _Sent,
     frequency: Tensor,
     quality: Quality,
     branching: str,
-    generator: torch.Generator,
-) -> tuple[Flight, tuple[Rays, Tensor, Tensor] | None]:
-    """One level of rays, and those that they send on. fresh: rays that have not scattered yet."""
+    generators: Sequence[torch.Generator],
+    last: bool,
+) -> tuple[Flight, _Sent]:
+    """One level of rays, and those that they send on, after the ``last`` none."""
+    rays, lattice, weight, fresh = sent.rays, sent.lattice, sent.weight, sent.fresh
     inside = crossings(world, rays, proxies.spans(rays), search_options(quality, quality.map_rays))
-    m = len(inside.ray)
+    m, owner = len(inside.ray), lattice[inside.ray]
     every = torch.arange(m, device=world.device)
     t = scalar(transmission_of(world, rays, inside, every, frequency))[:, 0].abs() ** 2
+    if last and branching == "enumerate":  # what reflects is of no account
+        toll = torch.where(t <= 0, torch.inf, -torch.log(t.clamp(min=1e-300)))
+        return Flight(rays, lattice, weight, rays.limit, inside, toll), sent.none()
     r, point, outgoing, front = _reflections(world, rays, inside, frequency)
-    aside = _scattered(world, rays, inside, front & fresh[inside.ray], frequency, generator)
+    may = front & fresh[inside.ray]
+    aside = _scattered(world, rays, inside, may, frequency, owner, generators)
     if branching == "draw":
         whole = r + aside.power
         share = torch.where(
             world.learned_surface[inside.which], 0.5, whole / (whole + t).clamp(min=1e-300)
         )
         share = torch.where(front, share, torch.zeros_like(share))
-        drawn = torch.rand(m, dtype=torch.float64, generator=generator).to(share) < share
+        drawn = _uniform(owner, generators, 1)[:, 0] < share
         toll = -torch.log((t / (1 - share).clamp(min=1e-300)).clamp(min=1e-300))
         gain = whole / share.clamp(min=1e-300)
     else:
@@ -163,21 +221,21 @@ def _fly(
         turned = torch.where(drawn, inside.enter, torch.inf)
         end = end.scatter_reduce(0, inside.ray, turned, "amin")
         drawn = drawn & (inside.enter <= end[inside.ray])
-        kinds = _either(r, outgoing, aside, gain, generator)
+        kinds = _either(r, outgoing, aside, gain, owner, generators)
     else:
         still = torch.zeros_like(drawn)
         kinds = [(outgoing, gain, ~still), (aside.direction, aside.power * aside.weight, still)]
-    flight = Flight(rays, weight, end, inside, toll)
-    floor = weight.max() * 10.0 ** (quality.floor_db / 10.0) if len(weight) else 0.0
+    strongest = weight.new_zeros(len(generators)).scatter_reduce(0, lattice, weight, "amax")
+    floor = (strongest * 10.0 ** (quality.floor_db / 10.0))[owner]
     parts = []
     for direction, power, straight in kinds:
         i = torch.nonzero(drawn & (arriving * power > floor)).squeeze(-1)
         kept = fresh[inside.ray[i]] & straight[i]
-        parts.append((point[i], direction[i], (arriving * power)[i], kept))
-    origin, direction, sent, kept = (torch.cat(c) for c in zip(*parts, strict=True))
-    if not len(sent):
-        return flight, None
-    return flight, (Rays(origin, direction, torch.full_like(sent, torch.inf)), sent, kept)
+        parts.append((point[i], direction[i], owner[i], (arriving * power)[i], kept))
+    origin, direction, whose, power, kept = (torch.cat(c) for c in zip(*parts, strict=True))
+    onward = Rays(origin, direction, torch.full_like(power, torch.inf))
+    flight = Flight(rays, lattice, weight, end, inside, toll)
+    return flight, sent.none() if last else _Sent(onward, whose, power, kept)
 
 
 @dataclass(frozen=True)
@@ -195,7 +253,8 @@ def _scattered(
     inside: Crossings,
     may: Tensor,
     frequency: Tensor,
-    generator: torch.Generator,
+    owner: Int[Tensor, "m"],
+    generators: Sequence[torch.Generator],
 ) -> _Aside:
     """Nothing where the surface is smooth, or a ray may not scatter."""
     d, normal = rays.direction[inside.ray], inside.normal_enter
@@ -207,7 +266,7 @@ def _scattered(
     which, point = inside.which[i], rays.origin[inside.ray[i]] + inside.enter[i, None] * d[i]
     contact = Contact(point, d[i], mirrored(d[i], normal[i]), normal[i])
     power[i] = scalar(world.diffuse(which, contact, frequency))[:, 0].abs() ** 2
-    uniform = torch.rand(len(i), 4, dtype=torch.float64, generator=generator).to(d)
+    uniform = _uniform(owner[i], generators, 4)
     for body, j in world.surface_groups(which):
         assert body.scattering is not None
         k = i[j]
@@ -216,13 +275,18 @@ def _scattered(
 
 
 def _either(
-    r: Tensor, outgoing: Tensor, aside: _Aside, gain: Tensor, generator: torch.Generator
+    r: Tensor,
+    outgoing: Tensor,
+    aside: _Aside,
+    gain: Tensor,
+    owner: Int[Tensor, "m"],
+    generators: Sequence[torch.Generator],
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Of mirror and diffuse ray one, drawn by their powers: (direction, power, whether mirrored)."""
     if not bool(aside.power.any()):
         return [(outgoing, gain, torch.ones_like(r, dtype=torch.bool))]
     chance = aside.power / (r + aside.power).clamp(min=1e-300)
-    off = torch.rand(len(r), dtype=torch.float64, generator=generator).to(r) < chance
+    off = _uniform(owner, generators, 1)[:, 0] < chance
     direction = torch.where(off[:, None], aside.direction, outgoing)
     return [(direction, torch.where(off, gain * aside.weight, gain), ~off)]
 
@@ -270,9 +334,10 @@ def estimate_power(
     aperture = float((SPEED_OF_LIGHT / f) ** 2) / (4 * math.pi)
     antennas = Antennas(scene.receivers, world.device)
     for t, radio in enumerate(scene.transmitters):
-        generator = torch.Generator().manual_seed(seed)
+        draws = Draws(seed)
         for copy in per_copy:
-            for flight in flights(world, proxies, radio, tx[t], f, quality, branching, generator):
+            lattice = Lattice(radio, tx[t], *draws.next())
+            for flight in flights(world, proxies, [lattice], f, quality, branching):
                 copy[t] += _collected(flight, antennas, rx, radius)
     per_copy *= aperture / (math.pi * radius**2)
     return per_copy.mean(0), per_copy.std(0) / COPIES**0.5

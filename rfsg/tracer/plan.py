@@ -168,7 +168,8 @@ def make_plan(world: World, quality: Quality) -> Plan:
         modelled.append("refraction in solids, at faces that are not parallel planes")
     if not quality.diffraction:
         left_out.append("edge diffraction: not asked for (diffraction=0)")
-    rough = any(n.body.scattering is not None for n in scene.nodes)
+    bodies = {id(n.body): n.body for n in scene.nodes}.values()  # instances of one are asked once
+    rough = any(body.scattering is not None for body in bodies)
     if not quality.diffuse:
         kept = "; mirrors do without the share all the same" * rough
         left_out.append(f"diffuse reflection: not asked for (diffuse=0){kept}")

@@ -231,6 +231,11 @@ class _Until:
                 [f"map: budget_s goes with method 'rays', which refines; {method!r} is exact"]
             )
 
+    def at_least(self, rounds: Rounds) -> int:
+        """Rounds to add before looking: one where time counts or somebody watches."""
+        watched = self.budget_s is not None or self.progress is not None
+        return 1 if watched else max(1, COPIES - rounds.count)
+
     def enough(self, rounds: Rounds, left_s: float, longest_s: float) -> bool:
         """Whether to stop, with so much time left, after rounds that took as long as ``longest_s``."""
         if left_s < longest_s or rounds.count >= MOST_ROUNDS:
@@ -361,7 +366,7 @@ def _by_rays(question: _Question, cells: Grid | Patches) -> RadioMap:
     until, begun, longest = question.until, time.monotonic(), 0.0
     while True:
         before = time.monotonic()
-        rounds.add()
+        rounds.add(until.at_least(rounds))
         now = time.monotonic()
         longest = max(longest, now - before)
         if rounds.count < LEAST_ROUNDS:

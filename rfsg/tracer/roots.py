@@ -1,4 +1,4 @@
-"""All crossings of rays with a baked shape, for the march."""
+"""All crossings of rays with a learned shape, baked or not, for the march."""
 
 from dataclasses import dataclass, replace
 
@@ -28,9 +28,9 @@ class Roots:
 
 
 @torch.no_grad()
-def baked_roots(
+def roots_on(
     shape: Shape,
-    baked: Baked,
+    baked: Baked | None,
     start: Float[Tensor, "m 3"],
     direction: Float[Tensor, "m 3"],
     end: Float[Tensor, "m"],
@@ -41,18 +41,21 @@ def baked_roots(
 ) -> Roots:
     """The first ``most`` roots on each ray within [0, end] and the bounds, in the rays' precision.
 
-    certain: marched on the baked values and by the network next to the surface, roots by ``rounds``
-    rounds of the Illinois method. The other ways as in ``intersect``. Raises ValueError for no known
-    way.
+    certain: marched on the baked values and by the network next to the surface, or where nothing is
+    baked by the network alone, whatever the way; roots by ``rounds`` rounds of the Illinois method.
+    The other ways as in ``intersect``. Raises ValueError for no known way.
     """
     if way not in WAYS:
         raise ValueError(f"intersection {way!r}: expected one of {', '.join(WAYS)}")
-    if way in ("mesh", "newton"):
+    if baked is not None and way in ("mesh", "newton"):
         return _peeled(intersector(shape, baked), start, direction, end, way == "newton", most)
-    used = baked if way == "certain" else replace(baked, error=torch.zeros_like(baked.error))
+    certain = baked is None or way == "certain"
+    used = baked
+    if baked is not None and not certain:
+        used = replace(baked, error=torch.zeros_like(baked.error))
     found = bracketed(shape, used, start, direction, end, floor, most)
     row = found.row
-    if way == "certain":
+    if certain:
         tolerance = 256 * torch.finfo(start.dtype).eps  # a network's own rounding
         t = polished(shape, start[row], direction[row], found, rounds, tolerance)
     else:

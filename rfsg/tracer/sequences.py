@@ -191,9 +191,9 @@ def _glint_chains(
                     world.point_object(node, after.prefixes.image[b]),
                 )
                 pair, sample = glints(item, *images)
-                stays = _promising(
-                    world, node[pair], sample, images[0][pair], images[1][pair], wavelength
-                )
+                ends = images[0][pair], images[1][pair]
+                look = wavelength, quality.newton, i + j == 0
+                stays = _promising(world, node[pair], sample, ends, *look)
                 pair, sample = pair[stays], sample[stays]
                 ends = before.take(a[pair]), after.take(b[pair])
                 parts.append(_glint_part(world, planes, item, node[pair], sample, ends, quality))
@@ -209,17 +209,20 @@ def _promising(
     world: World,
     node: Int[Tensor, "m"],
     sample: Int[Tensor, "m"],
-    fore: Float[Tensor, "m 3"],
-    aft: Float[Tensor, "m 3"],
+    ends: tuple[Float[Tensor, "m 3"], Float[Tensor, "m 3"]],
     wavelength: float,
+    steps: int,
+    lone: bool,
 ) -> Int[Tensor, "k"]:
-    """Candidates on nodes of one shape that a first look at the face, if it is learned, leaves."""
+    """Candidates on nodes of one shape that a first look at the face, if it is learned, leaves.
+
+    ends: the images in the nodes' frames. steps, lone: see ``glances.astray``."""
     stays = torch.ones_like(node, dtype=torch.bool)
     for scale in torch.unique(world.scale[node[~world.exact[node]]]).tolist():
         i = torch.nonzero(world.scale[node] == scale).squeeze(-1)
         shape = world.scene.nodes[int(node[i[0]])].body.shape
         looks = looks_at(shape, world.device, wavelength / scale)
-        stays[i] = ~astray(looks, sample[i], fore[i], aft[i])
+        stays[i] = ~astray(looks, sample[i], ends[0][i], ends[1][i], steps, lone)
     return torch.nonzero(stays).squeeze(-1)
 
 

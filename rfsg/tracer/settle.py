@@ -17,8 +17,9 @@ from rfsg.tracer import zone
 from rfsg.tracer.faces import nearest_facets
 from rfsg.tracer.feet import Feet
 from rfsg.tracer.implicit import segments
+from rfsg.tracer.lone import stationary
 from rfsg.tracer.mixing import History
-from rfsg.tracer.newton import ROUNDING, Batch, newton, surfaces_of
+from rfsg.tracer.newton import NEWTON_SETTLED, ROUNDING, Batch, newton, surfaces_of
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Status
 from rfsg.tracer.zone import Facets, Zones
@@ -96,8 +97,14 @@ class Settling:
         return Zones(self.world, which[i], x, n, reach, self.wavelength, rings), radius
 
     def solve(self, part: Batch, facets: Facets) -> Seen:
-        surfaces = surfaces_of(self.world, part, facets)
-        moved, settled = newton(part, surfaces, self.quality.newton)
+        surfaces, steps = surfaces_of(self.world, part, facets), self.quality.newton
+        if part.x.shape[1] == 1:
+            floor = ROUNDING * part.polyline().abs().amax((1, 2))
+            ends = part.x[:, 0], part.tx, part.rx
+            moved, settled = stationary(facets, *ends, steps, NEWTON_SETTLED, floor)
+            moved = moved[:, None]
+        else:
+            moved, settled = newton(part, surfaces, steps)
         bend = torch.zeros_like(surfaces.plane_offset)
         bend[surfaces.learned] = facets.curvature()
         normal = unit(surfaces.jet(moved).gradient)
@@ -108,10 +115,9 @@ def settle(
     world: World, batch: Batch, wavelength: float, quality: Quality
 ) -> tuple[Float[Tensor, "c d 3"], Tensor, Charts]:
     """Vertices at rest, status [c] and the charts they rest on, of chains with learned vertices."""
-    state = _start(world, batch)
-    rows = torch.arange(len(batch.x), device=world.device)
+    state = _start(batch)
     settling = Settling(world, wavelength, quality)
-    rows, _ = _round(settling, batch, state, rows, look=True)
+    rows = _look(settling, batch, state)
     rough = replace(settling, world=world.sketched(zone.SKETCHED * wavelength))
     rows = _rounds(rough, batch, state, rows, torch.float32)
     twin = _twins(batch.take(rows), state.x[rows])
@@ -122,14 +128,26 @@ def settle(
     return state.x, state.status, state.charts
 
 
-def _start(world: World, batch: Batch) -> State:
+def _start(batch: Batch) -> State:
+    """Nothing known but where the chains begin: normals and bends are the first look's to say."""
     c, depth = batch.which.shape
-    normal = world.normal(batch.which.reshape(-1), batch.x.reshape(-1, 3)).reshape(c, depth, 3)
-    flat = torch.zeros(c, depth, dtype=torch.float64, device=world.device)
-    status = torch.full((c,), int(Status.NOT_CONVERGED), device=world.device)
-    charts = Charts(batch.x.clone(), normal, flat)
+    flat = torch.zeros_like(batch.x[..., 0])
+    status = torch.full((c,), int(Status.NOT_CONVERGED), device=batch.x.device)
+    charts = Charts(batch.x.clone(), torch.zeros_like(batch.x), flat)
     history = History.none(c, 7 * depth, batch.x)
     return State(batch.x.clone(), status, charts, flat.clone(), history)
+
+
+def _look(settling: Settling, batch: Batch, state: State) -> Tensor:
+    """The first look, at facets measured beforehand; returns the rows that go on."""
+    world = settling.world
+    learned = ~world.exact[batch.which]
+    facets = nearest_facets(world, batch.which[learned], batch.x[learned], settling.wavelength)
+    seen = settling.solve(batch, facets)
+    lost = _lost(settling, batch, seen, facets, learned, precise=False, first=True)
+    state.status = torch.where(lost > 0, lost, state.status)
+    state.x, state.charts.normal[:], state.curvature = seen.moved, seen.normal, seen.curvature
+    return torch.nonzero(lost == 0).squeeze(-1)
 
 
 def _rounds(
@@ -159,10 +177,9 @@ def _round(
     state: State,
     rows: Tensor,
     *,
-    look: bool = False,
-    dtype: torch.dtype = torch.float32,
-    number: int = 0,
-    feet: Feet | None = None,
+    dtype: torch.dtype,
+    number: int,
+    feet: Feet | None,
 ) -> tuple[Tensor, Feet | None]:
     """One measurement and one solve of the rows given; returns those that go on, and their feet."""
     if not len(rows):
@@ -172,17 +189,14 @@ def _round(
     part.x = state.x[rows]
     learned = ~world.exact[part.which]
     zones, radius = settling.zones(part, state.charts.normal[rows], state.curvature[rows])
-    if look:
-        facets = nearest_facets(world, zones.which, zones.centre, settling.wavelength)
-    else:
-        facets, feet = zones.measured(dtype, feet)
-        state.charts.centre[rows], state.charts.radius[rows] = part.x, radius
+    facets, feet = zones.measured(dtype, feet)
+    state.charts.centre[rows], state.charts.radius[rows] = part.x, radius
     seen = settling.solve(part, facets)
     moved = seen.moved
     step = (moved - part.x).norm(dim=-1).amax(-1)
     least = SETTLED + ROUNDING * moved.abs().amax((1, 2)) if precise else NEARLY
-    at_rest = (not look) & seen.settled & (step < least)
-    lost = _lost(settling, part, seen, facets, learned, precise, look or number == 0)
+    at_rest = seen.settled & (step < least)
+    lost = _lost(settling, part, seen, facets, learned, precise, number == 0)
     restless = (step > RESTLESS * radius.amax(1) * SHRINKING ** (number - PATIENCE)) & (
         number >= PATIENCE
     )
@@ -196,8 +210,7 @@ def _round(
         go = go & ~twin
     state.x[rows] = moved
     _advance(state, rows, part, seen, radius, number, go, all_of_it=precise or number >= LATE)
-    if feet is not None:
-        feet = feet.take(torch.nonzero(go[torch.nonzero(learned)[:, 0]]).squeeze(-1))
+    feet = feet.take(torch.nonzero(go[torch.nonzero(learned)[:, 0]]).squeeze(-1))
     return rows[go], feet
 
 
@@ -271,11 +284,6 @@ def _lost(
     hopeless[unresolved & (still | precise)] = int(Status.UNRESOLVED)
     if precise:
         hopeless[~seen.settled] = int(Status.NOT_CONVERGED)
-    which = batch.which.reshape(-1)
-    f, gradient = world.value_and_gradient(which, moved.reshape(-1, 3), torch.float32)
-    # beyond its bounds a network may say anything; the surface is at least as far as they are
-    f = torch.maximum(f.abs(), _beyond(world, which, moved.reshape(-1, 3)))
-    f, gradient = f.reshape(c, depth), gradient.reshape(c, depth, 3)
     # a stationary point off the object by a tenth of its size is another object's business
     allowed = 2.0 * tolerance(world, batch, wavelength)
     far = torch.where(
@@ -285,10 +293,20 @@ def _lost(
     far = torch.where(
         (still | (not first))[:, None], torch.minimum(far, RETURN * stride + STILL), far
     )
-    off = f > (allowed if precise else allowed + far)
-    if not first:
-        off |= learned & ((gradient * seen.normal).sum(-1) < 0)  # another face, seen from behind
-    hopeless[off.any(1) | ~torch.isfinite(moved).all(-1).all(-1)] = int(Status.OFF_SURFACE)
+    most = allowed if precise else allowed + far
+    # beyond its bounds a network may say anything; the surface is at least as far as they are
+    beyond = _beyond(world, batch.which.reshape(-1), moved.reshape(-1, 3)).reshape(c, depth)
+    off = (beyond > most).any(1) | ~torch.isfinite(moved).all(-1).all(-1)
+    i = torch.nonzero(~off).squeeze(-1)  # and only these are worth asking about
+    f, gradient = world.value_and_gradient(
+        batch.which[i].reshape(-1), moved[i].reshape(-1, 3), torch.float32
+    )
+    past = f.reshape(-1, depth).abs() > most[i]
+    if not first:  # another face, seen from behind
+        behind = (gradient.reshape(-1, depth, 3) * seen.normal[i]).sum(-1) < 0
+        past |= learned[i] & behind
+    off[i] = past.any(1)
+    hopeless[off] = int(Status.OFF_SURFACE)
     return hopeless
 
 

@@ -23,6 +23,7 @@ from rfsg.tracer.known import KnownEdges, known_edges
 from rfsg.tracer.launch import SearchReport, search
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.records import Act, Chains, Failed, Found, Only, Paths, Status
+from rfsg.tracer.renewed import new_chains
 from rfsg.tracer.seams import coincident
 from rfsg.tracer.solve import solve_each
 
@@ -97,9 +98,23 @@ def candidates(run: Run, since: Since | None) -> Candidates:
 
 
 def _searched(run: Run, only: Only | None) -> Candidates:
-    where = (run.world, run.proxies, run.tx, run.rx, run.frequency, run.quality)
-    chains, report = search(*where, only)
+    ends = (run.tx, run.rx, run.frequency, run.quality)
+    # to a few receivers it is quicker to find the whole as if all of them had just come
+    chains = new_chains(run.world, *ends, _receivers(run) if only is None else only)
+    if chains is not None:
+        report = SearchReport(candidates=len(chains.tx), complete=True, enumerated=True)
+        report.restricted = only is not None
+    else:
+        chains, report = search(run.world, run.proxies, *ends, only)
     return Candidates(chains, run.none(), report, True)
+
+
+def _receivers(run: Run) -> Only:
+    """All that ends at a receiver; or at a transmitter, where those are more and so looked at last."""
+    back = len(run.rx) < len(run.tx)
+    none, every = (torch.zeros(len(x), dtype=torch.bool, device=x.device) for x in (run.tx, run.rx))
+    node = torch.zeros(len(run.world), dtype=torch.bool, device=every.device)
+    return Only(node, none | back, every | (not back), none[:0])
 
 
 def _beside(since: Since, rows: Tensor, perhaps: Tensor, found: Candidates) -> Candidates:

@@ -15,9 +15,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from rfsg.objects.shapes.band import WAYS
+from rfsg.objects.shapes.kept import BAKE_AFTER, baked_if_it_pays
 from rfsg.scene.scene import Scene
 from rfsg.tracer.compared import Difference, Seen, difference, see
 from rfsg.tracer.ladder import effective, ladder
+from rfsg.tracer.launch import search_options
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import Result, resolve_frequency, simulate
 
@@ -28,11 +31,10 @@ BASE = "base"
 Progress = Callable[[str], None]
 
 # one at a time, from the base; the values of a field that the base has are left out
-VARIATIONS: dict[str, tuple[Any, ...]] = {  # those first that make nothing slower
+VARIATIONS: dict[str, tuple[Any, ...]] = {
     "crossing_samples": (4, 64),
     "zone_rings": (1, 4),
     "refits": (4, 8),
-    "intersection": ("newton", "mesh", "grid"),
     "floor_db": (-30.0, -50.0, -120.0),
     "refraction": (False,),
     "diffraction_depth": (1, 3),
@@ -49,10 +51,19 @@ INTEGRALS: tuple[dict[str, Any], ...] = (
 BY_RAYS: tuple[dict[str, Any], ...] = (
     {"search": "rays", "rays": 2_000},
     {"search": "rays", "rays": 20_000},
-    {"search": "rays", "rays": 100_000},
     {"search": "rays", "rays": 20_000, "epsilon": 0.001},
     {"search": "rays", "rays": 20_000, "epsilon": 0.05},
 )
+# where shapes are learned: at first a march on the network itself, as for any fewer rays; from BAKE_AFTER
+# on they are baked
+MEETINGS: tuple[dict[str, Any], ...] = (
+    {"search": "rays", "rays": BAKE_AFTER - 1},
+    *({"search": "rays", "rays": BAKE_AFTER, "intersection": way} for way in WAYS),
+)
+# what one more of a field multiplies the time by, nearly, and how many rays take the time of all else:
+# they order the grid, and nothing is begun that would take longer than is left
+DEARER = {"depth": 2.0, "diffraction": 9.0, "diffraction_depth": 2.5, "curved_depth": 2.0}
+RAYS_ALIKE = 20_000
 PRODUCT = ("depth", "diffraction", "curved_depth")  # of ``grid="full"``, every combination
 
 
@@ -126,9 +137,10 @@ def tradeoff(
     """Run a grid of settings on a scene, and say what each costs and lacks.
 
     base: the setting that single fields are changed of. grid: "small", the ladder and one change at
-    a time; "full", besides every combination of depth, diffraction and curved_depth. budget_s: no
-    setting is begun that is not expected to fit [s]; one under way is left at the next stage once
-    time is up. Raises ValueError for another grid or a budget that is not positive.
+    a time, those first that are expected to be quick; "full", besides every combination of depth,
+    diffraction and curved_depth. budget_s: no setting is begun that is not expected to fit [s]; one
+    under way is left at the next stage once time is up. Raises ValueError for another grid or a budget
+    that is not positive.
     """
     if grid not in ("small", "full"):
         raise ValueError(f"grid {grid!r}: expected small or full")
@@ -137,11 +149,9 @@ def tradeoff(
     base = Quality.named(base) if isinstance(base, str) else base
     done = _Runs(scene, frequency, budget_s, device, progress, run)
     name = done.climb()
-    for setting, quality in settings(base, grid):
-        seen = done.one(setting, quality, budget_s)
-        done.base = seen if setting == BASE else done.base
     if name is None:
         raise ValueError(f"budget_s={budget_s:g}: not even the cheapest setting was done by then")
+    done.grid(base, grid)
     truth = done.seen[name]
     outcomes = with_front([done.outcome(setting, truth, base) for setting in done.seen])
     pick = recommend([o for o in outcomes if o.setting != name], accuracy_db)
@@ -168,18 +178,31 @@ def recommend(outcomes: Sequence[Outcome], accuracy_db: float) -> str | None:
     return min(enough, key=lambda o: o.seconds).setting if enough else None
 
 
-def settings(base: Quality, grid: str) -> Iterator[tuple[str, Quality]]:
-    """Names and qualities: the base, one change at a time, and with "full" the product."""
-    known = {f.name for f in fields(Quality)}
-    yield BASE, base
+def settings(base: Quality, grid: str, learned: bool = True) -> list[tuple[str, Quality]]:
+    """Names and qualities: the base, then one change at a time, and with "full" the product, those
+    first that are expected to be quick (``times``). learned: with the ways to meet learned shapes."""
     changes = [{name: value} for name, values in VARIATIONS.items() for value in values]
-    changes = [*INTEGRALS, *changes, *BY_RAYS]
+    changes = [*INTEGRALS, *changes, *BY_RAYS, *(MEETINGS if learned else ())]
     if grid == "full":
         ranges = [range(1, 6), range(3), range(1, 4)]
         changes += [dict(zip(PRODUCT, v, strict=True)) for v in product(*ranges)]
-    for change in changes:
-        if set(change) <= known and any(getattr(base, k) != v for k, v in change.items()):
-            yield ", ".join(f"{k} {v}" for k, v in change.items()), replace(base, **change)
+    named = [
+        (", ".join(f"{k} {v}" for k, v in change.items()), replace(base, **change))
+        for change in changes
+        if any(getattr(base, k) != v for k, v in change.items())
+    ]
+    return [(BASE, base), *sorted(named, key=lambda one: times(one[1], base))]
+
+
+def times(quality: Quality, base: Quality) -> float:
+    """How many times as long as the base a setting is expected to take: a guess, by ``DEARER``."""
+    steps = {name: getattr(quality, name) - getattr(base, name) for name in DEARER}
+    factor = math.prod(DEARER[name] ** steps[name] for name in DEARER)
+    return factor * _launched(quality) / _launched(base)
+
+
+def _launched(quality: Quality) -> float:
+    return 1.0 + quality.rays / RAYS_ALIKE if quality.search == "rays" else 1.0
 
 
 def changed(quality: Quality, base: Quality) -> dict[str, Any]:
@@ -211,7 +234,7 @@ class _Runs:
         self.quality: dict[str, Quality] = {}
         self.cost: dict[str, tuple[float, int, float | None]] = {}  # seconds, runs, peak MiB
         self.left_out: list[str] = []
-        self.base: Seen | None = None
+        self.base: str | None = None  # what the base stands under
 
     def climb(self) -> str | None:
         """Rung after rung of the ladder, while the next is expected to fit; the last one done."""
@@ -228,17 +251,31 @@ class _Runs:
             top = rung.name
         return top
 
-    def one(self, setting: str, quality: Quality, until: float) -> Seen | None:
-        """Run one setting, unless an equal one was; None where time was up before it ended."""
+    def grid(self, base: Quality, grid: str) -> None:
+        """The base, and what is changed of it, each setting that is expected to fit."""
+        learned = not all(node.body.shape.exact for node in self.scene.nodes)
+        for setting, quality in settings(base, grid, learned):
+            one = 0.0 if self.base is None else self.cost[self.base][0]
+            found = self.one(setting, quality, self.budget_s, one * times(quality, base))
+            self.base = found if setting == BASE else self.base
+
+    def one(
+        self, setting: str, quality: Quality, until: float, expected: float = 0.0
+    ) -> str | None:
+        """Run one setting, unless an equal one was; the name that it stands under, or None where it
+        would take until after ``until`` [s] or did."""
         asked = effective(quality, self.scene)
         same = next((n for n, q in self.quality.items() if effective(q, self.scene) == asked), None)
         if same is not None:
             self.left_out.append(f"{setting}: the same as {same!r} on this scene")
-            return self.seen[same]
-        if self.spent() > until:
-            self.left_out.append(f"{setting}: no time left")
+            return same
+        left = until - self.spent()
+        if expected > left or left < 0.0:
+            would = f"would take some {expected:.2g} s, and {left:.2g} s of the time were left"
+            self.left_out.append(f"{setting}: {would if left > 0.0 else 'no time left'}")
             return None
         self.tell(setting)
+        self._bake(asked)
         seconds: list[float] = []
         found: Result | None = None
         try:
@@ -256,14 +293,23 @@ class _Runs:
         assert found is not None
         self.seen[setting], self.quality[setting] = see(found), quality
         self.cost[setting] = (statistics.median(seconds), len(seconds), peak[0])
-        return self.seen[setting]
+        return setting
+
+    def _bake(self, quality: Quality) -> None:
+        """What rays need of learned shapes: it is kept beside them, and belongs to no setting."""
+        if quality.search == "rays":
+            rays = search_options(quality, quality.rays).rays
+            for shape in {id(n.body.shape): n.body.shape for n in self.scene.nodes}.values():
+                baked_if_it_pays(shape, rays)
 
     def outcome(self, setting: str, truth: Seen, base: Quality) -> Outcome:
         """A setting's cost, and its error against the truth."""
         seen, fields_changed = self.seen[setting], changed(self.quality[setting], base)
         error = difference(seen, truth)
         cost = self.cost[setting]
-        moved = math.inf if self.base is None else difference(seen, self.base).gain_90_db
+        moved = math.inf
+        if self.base is not None:
+            moved = difference(seen, self.seen[self.base]).gain_90_db
         return Outcome(setting, fields_changed, *cost, seen.count, seen.complete, error, moved)
 
     def spent(self) -> float:

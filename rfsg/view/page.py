@@ -17,6 +17,7 @@ from viser import transforms
 from rfsg.objects.plain import array
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import SceneError
+from rfsg.view.guard import guarded
 from rfsg.view.panel import Panel
 from rfsg.view.picture import Picture
 from rfsg.view.session import Session
@@ -30,7 +31,10 @@ class Page:
     def __init__(self, session: Session, port: int = 8080, title: str = "rfsg"):
         self.session = session
         self._lock = threading.RLock()
-        self.server = viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
+        self._closed = False
+        self.server = guarded(
+            lambda: viser.ViserServer(host=HOST, port=port or free_port(), verbose=False)
+        )
         self.server.gui.configure_theme(
             control_width="large",
             show_logo=False,
@@ -51,8 +55,22 @@ class Page:
 
     def close(self) -> None:
         """Stop serving."""
-        self.session.changed = lambda: None
-        self.server.stop()
+        with self._lock:  # an answer may be on its way
+            self.session.changed = lambda: None
+            self._closed = True
+            self.server.stop()
+
+    def refresh(self) -> None:
+        """Take over what others edited on the stage (``Session.refresh``), and show it."""
+        with self._lock:
+            try:
+                changed = self.session.refresh()
+            except (SceneError, OSError) as error:
+                self.panel.tell(str(error))
+                return
+            if changed:
+                self.panel.tell("the scene was changed elsewhere: this is how it stands now")
+                self.draw()
 
     def draw(self) -> None:
         """Everything anew: after an edit."""
@@ -64,6 +82,8 @@ class Page:
     def draw_answer(self) -> None:
         """What the simulation says, and the panel: after an answer."""
         with self._lock, self.server.atomic():
+            if self._closed:
+                return
             self.picture.draw_paths(self.session, self.panel.shown(), self.panel.every_link.value)
             self.picture.draw_map(self.session, self.panel.opacity.value)
             self.panel.refresh(self.picture.range_db, self.picture.map_range)

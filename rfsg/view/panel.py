@@ -17,7 +17,7 @@ from rfsg.view import words
 from rfsg.view.session import Session
 
 NOTHING = "(nothing)"
-NO_ASSET = "(choose)"
+NO_ASSET = NO_VARIANT = "(choose)"
 STEP = 0.001  # [m] of the numbers that say a place
 WALLS = 0.16  # opacity of what is large
 
@@ -33,13 +33,17 @@ class Panel:
         draw: Callable[[], None],
     ):
         self._session, self._act, self._draw = session, act, draw
+        self._gui = server.gui
+        self._variants: dict[tuple[str, str], Any] = {}  # by prim and set: there while they concern
+        self.said = ""  # above the panel
         self._writing = False  # values that we set ourselves are no wishes
         gui = server.gui
         self._status = gui.add_markdown("")
         self._told = gui.add_markdown("", visible=False)
         with gui.add_folder("Link"):
             self._build_link(gui)
-        with gui.add_folder("Selected"):
+        self._selected = gui.add_folder("Selected")
+        with self._selected:
             self._build_selected(gui)
         with gui.add_folder("Shown", expand_by_default=False):
             self._build_shown(gui)
@@ -134,6 +138,9 @@ class Panel:
         if self._asset.value != NO_ASSET:
             self._session.swap(self._path(), self._asset.value)
 
+    def _vary(self, key: tuple[str, str]) -> None:
+        self._session.vary(*key, self._variants[key].value)
+
     def _duplicate(self) -> None:
         self._session.duplicate(self._path())
 
@@ -151,6 +158,7 @@ class Panel:
 
     def tell(self, sentence: str) -> None:
         """Say something above the panel; empty to say nothing."""
+        self.said = sentence
         self._told.content, self._told.visible = words.plain(sentence), bool(sentence)
 
     def show_place(self, pose: Pose) -> None:
@@ -172,6 +180,7 @@ class Panel:
         object_is = session.selected is not None and isinstance(session.thing(selected), Node)
         self._place.disabled = self._yaw.disabled = session.selected is None
         self._asset.disabled = not object_is
+        self._show_variants()
         if session.selected is not None:
             self.show_place(session.pose(session.selected))
         self._status.content = words.status(session)
@@ -183,6 +192,21 @@ class Panel:
             words.scale_bar("received power, best server", *map_range, "dBm", MAP) if there else ""
         )
         self._show_delays()
+
+    def _show_variants(self) -> None:
+        """One list for each variant set that the selected thing is part of."""
+        sets = {(one.path, one.name): one for one in self._session.variants()}
+        for key in [key for key in self._variants if key not in sets]:
+            self._variants.pop(key).remove()
+        for key, one in sets.items():
+            options = one.choices if one.chosen else (NO_VARIANT, *one.choices)
+            if key not in self._variants:
+                with self._selected:
+                    name = f"{words.short(one.path)}: {one.name}"
+                    widget = self._gui.add_dropdown(name, options)
+                widget.on_update(self._wish(lambda key=key: self._vary(key)))
+                self._variants[key] = widget
+            self._choices(self._variants[key], options, one.chosen or NO_VARIANT)
 
     def _show_delays(self) -> None:
         lines = sorted(self._session.lines(), key=lambda line: line.delay_ns)

@@ -9,7 +9,9 @@ from typing import Any
 from rfsg.scene.library import Library
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import Radio
-from rfsg.scene.scene import Node, Scene, SceneError
+from rfsg.scene.scene import Node, Scene, SceneError, merged
+from rfsg.scene.usd.live import LiveScene
+from rfsg.scene.usd.variants import VariantSet, variant_sets
 from rfsg.tracer.channel import Link
 from rfsg.tracer.drawing import Line, path_lines
 from rfsg.tracer.radiomap import RadioMap
@@ -25,7 +27,8 @@ class Session:
     selected: the prim path of an object or a radio, None for nothing. link: paths of the transmitter
     and the receiver looked at. answer: the latest; its result may be a draft of the link alone, of a
     scene that was a moment ago. radio_map: the latest, of a scene at rest. save_to: where ``save``
-    writes. Methods may be called from any thread. Raises SceneError as the edits of a ``Scene`` do.
+    writes. live: what ``scene`` was read by, if ``refresh`` is to follow what others edit there.
+    Methods may be called from any thread. Raises SceneError as the edits of a ``Scene`` do.
     """
 
     def __init__(
@@ -38,6 +41,7 @@ class Session:
         save_to: Path | None = None,
         overwrite: bool = False,
         map_options: dict[str, Any] | None = None,
+        live: LiveScene | None = None,
         changed: Callable[[], None] = lambda: None,
     ):
         self.scene, self.library, self.save_to = scene, library, save_to
@@ -47,6 +51,8 @@ class Session:
         self.radio_map: RadioMap | None = None
         self.changed = changed
         self._overwrite = overwrite
+        self._live, self._followed = live, None if live is None else live.scene
+        self._variants: tuple[Any, tuple[VariantSet, ...]] = (None, ())
         self._undo: list[Scene] = []
         self._held: Scene | None = None  # what a drag began with
         self._lines: tuple[Any, list[Line]] = (None, [])
@@ -72,6 +78,15 @@ class Session:
         if isinstance(thing, Node):
             return thing.pose
         return replace(Pose.identity(), rotation=thing.rotation, translation=thing.position)
+
+    def variants(self) -> tuple[VariantSet, ...]:
+        """The variant sets that what is selected is part of."""
+        scene, path = self.scene, self.selected
+        if path is None:
+            return ()
+        if self._variants[0] is not scene.source:
+            self._variants = (scene.source, variant_sets(scene))
+        return tuple(one for one in self._variants[1] if one.concerns(path))
 
     @property
     def settled(self) -> bool:
@@ -169,6 +184,10 @@ class Session:
             raise SceneError([f"{path}: no library was given to take {asset} from (--library)"])
         self._edit(self.scene.replaced(path, self.library[asset]))
 
+    def vary(self, path: str, variant_set: str, name: str) -> None:
+        """Choose a variant of a prim."""
+        self._edit(self.scene.with_variant(path, variant_set, name))
+
     def remove(self, path: str) -> None:
         """Take an object or a radio out, and what stands below it."""
         self._edit(self.scene.without(path))
@@ -194,6 +213,25 @@ class Session:
                 self.scene = self._undo.pop()
                 self._tidy()
                 self._ask()
+
+    def refresh(self) -> bool:
+        """Take over what was edited on the stage by pxr calls, or in its files by another program,
+        below the edits made here; whether there was something. Raises SceneError, as ``LiveScene``.
+
+        Not while another thread edits the stage: OpenUSD allows one or many that read."""
+        if self._live is None:
+            return False
+        with self._told:
+            new = self._live.scene
+            if new is self._followed:
+                return False
+            below = _Below(new)
+            scene, undo = below.put(self.scene), [below.put(old) for old in self._undo]
+            held = None if self._held is None else below.put(self._held)
+            self._followed, self.scene, self._undo, self._held = new, scene, undo, held
+            self._tidy()
+            self._ask(at_rest=held is None)
+            return True
 
     def save(self) -> Path:
         """Write the edits as a layer over the scene. Raises SceneError, as ``Scene.save_edits``."""
@@ -238,6 +276,27 @@ class Session:
                 self.radio_map = answer.radio_map
             self._told.notify_all()
         self.changed()
+
+
+class _Below:
+    """A scene read anew, to be put below edits of what it was before."""
+
+    def __init__(self, scene: Scene):
+        self._scene = scene
+        self._varied: dict[str, Scene] = {}
+
+    def put(self, edited: Scene) -> Scene:
+        """The new scene with those edits, the chosen variants included."""
+        chosen = edited.source.options.variants
+        new = self._varied.get(repr(chosen))
+        if new is None:
+            new = self._scene
+            for path, sets in chosen.items():
+                for name, choice in sets.items():
+                    if self._scene.source.options.variants.get(path, {}).get(name) != choice:
+                        new = new.with_variant(path, name, choice)
+            self._varied[repr(chosen)] = new
+        return merged(edited, edited.source.base, new)
 
 
 def _link_of(scene: Scene, last: tuple[str, str] | None) -> tuple[str, str] | None:

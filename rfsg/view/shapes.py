@@ -79,11 +79,15 @@ def drawn(pose: Pose, vertices: ndarray, faces: ndarray) -> tuple[ndarray, ndarr
 def extent(scene: Scene) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
     """Corners of the box about all objects that have an end, and all radios [m]."""
     corners = [array(r.position)[None] for r in (*scene.transmitters, *scene.receivers)]
-    corners += [box for node in scene.nodes if np.isfinite(box := _corners(node)).all()]
+    corners += [_corners(node) for node in scene.nodes if _has_end(node)]
     if not corners:
         return np.zeros(3), np.ones(3)
     every = np.concatenate(corners)
     return every.min(axis=0), every.max(axis=0)
+
+
+def _has_end(node: Node) -> bool:
+    return bool(node.body.shape.bounds().isfinite().all())
 
 
 def _corners(node: Node) -> Float[ndarray, "8 3"]:

@@ -5,8 +5,7 @@ A new kind is one entry here. The laws in this folder are tried on every example
 """
 
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import torch
@@ -20,15 +19,18 @@ from rfsg.objects.surfaces.interface import Conductor, DielectricHalfSpace
 from rfsg.objects.surfaces.slab import Slab
 from rfsg.objects.surfaces.solid import Solid
 from rfsg.objects.surfaces.stochastic import StochasticSurface
-from rfsg.scene.assets import load_asset
 from rfsg.scene.world import unit
 from rfsg.tracer.march import MarchOptions, march
+from tests import shipped
 
 F64 = torch.float64
 Met = TypeVar("Met", Contact, Crossing)
-OBJECTS = Path(__file__).resolve().parents[2] / "assets" / "objects"
 FREQUENCY = torch.tensor([1.1e9, 2.4e9, 28e9, 90e9], dtype=F64)  # where ITU knows concrete
 UNBOUNDED = (1.0, 1.0, 0.2)  # [m] half the box in which a shape without bounds is looked at
+FEW, MANY = (
+    2_000,
+    10_000,
+)  # contacts and crossings that a law is tried on: at every turn, and at length
 MARCH = MarchOptions(step_floor=1e-2, dtype=F64, polish=40)
 
 LAMBERTIAN = {"coefficient": 0.4, "cross_share": 0.1}
@@ -64,14 +66,6 @@ def lumpy() -> NeuralShape:
     return shape
 
 
-@cache
-def cabinet() -> NeuralShape:
-    """A trained one."""
-    shape = load_asset(OBJECTS / "cabinet" / "cabinet.usda").body.shape
-    assert isinstance(shape, NeuralShape)
-    return shape
-
-
 def lively(**arguments) -> StochasticSurface:
     """A stochastic surface whose fields vary from point to point, as after a fit."""
     surface = StochasticSurface(samples=2, **arguments)
@@ -100,7 +94,7 @@ SHAPES: dict[str, dict[str, Callable[[], Shape]]] = {
     "capsule": {"": lambda: Capsule(0.2, 0.3)},
     "halfspace": {"": HalfSpace},
     "mesh": {"": angle_iron, "prism": prism},
-    "neural": {"": lumpy, "cabinet": cabinet},
+    "neural": {"": lumpy, "cabinet": partial(shipped.shape, "cabinet")},
 }
 SURFACES: dict[str, dict[str, Callable[[], Surface]]] = {
     "conductor": {"": Conductor, "rough": lambda: Conductor(TWO_LOBES)},
@@ -140,7 +134,7 @@ def made(table: dict[str, dict[str, Callable]], name: str) -> Any:
 
 
 @cache
-def chords(name: str, count: int = 10_000) -> tuple[Shape, Crossing]:
+def chords(name: str, count: int = FEW) -> tuple[Shape, Crossing]:
     """Stretches of random lines inside a shape; every tenth begins inside, every tenth ends inside."""
     shape = made(SHAPES, name)
     start, end = _stretches(name, count)
@@ -155,7 +149,7 @@ def chords(name: str, count: int = 10_000) -> tuple[Shape, Crossing]:
 
 
 @cache
-def contacts(name: str, count: int = 10_000) -> tuple[Shape, Contact]:
+def contacts(name: str, count: int = FEW) -> tuple[Shape, Contact]:
     """Mirrors all over a shape, at every angle; some within a hair of grazing, some head on."""
     shape = made(SHAPES, name)
     point = torch.cat(_stretches(name, count))

@@ -278,12 +278,23 @@ def test_interrupted_training_ends_with_the_same_bits(tmp_path, monkeypatch):
         assert torch.equal(value, resumed.state_dict()[name])
     with pytest.raises(LearnError, match="another training"):
         geometry.learn_shape(mesh, steps=21, seed=3, checkpoint=checkpoint)
+    with pytest.raises(LearnError, match="another training"):
+        geometry.learn_shape(mesh, steps=20, seed=3, width=32, checkpoint=checkpoint)
     checkpoint.write_bytes(b"broken")
     with pytest.raises(LearnError, match="cannot|can be read"):
         geometry.learn_shape(mesh, steps=20, seed=3, checkpoint=checkpoint)
     save_file({"a": torch.zeros(1)}, checkpoint)
     with pytest.raises(LearnError, match="another training"):
         geometry.learn_shape(mesh, steps=20, seed=3, checkpoint=checkpoint)
+
+
+def test_a_network_is_as_wide_as_asked(monkeypatch):
+    monkeypatch.setattr(geometry, "_require_positive_boundary", lambda shape: None)
+    monkeypatch.setattr(geometry, "measure", lambda *_, **__: Report(*[0.0] * 12, 1, 0))
+    shape, _ = geometry.learn_shape(box(), steps=1, width=24)
+    assert shape.width == 24 and shape.hidden[1].weight.shape == (24, 24)
+    with pytest.raises(LearnError, match="width=0: expected at least 1"):
+        geometry.learn_shape(box(), steps=1, width=0)
 
 
 def test_a_surface_that_leaves_its_bounds_is_refused():

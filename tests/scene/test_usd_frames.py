@@ -233,11 +233,33 @@ def test_a_mesh_absorbs_an_uneven_scale(scene_file):
     )
 
 
-def test_a_neural_object_refuses_an_uneven_scale(scene_file, asset_here):
-    """Its distances would not be distances any more."""
-    path = scene_file(place({"scale": (1, 2, 1)}))
-    with pytest.raises(SceneError, match="/World/A: a neural object cannot be scaled differently"):
-        Scene.from_usd(path)
+def test_a_neural_object_is_stretched_by_an_uneven_scale_with_one_warning(
+    scene_file, asset_here, small_asset
+):
+    scene = Scene.from_usd(scene_file(place({"scale": (1, 2, -4)})))
+    (said,) = [w for w in scene.warnings if "scaled unevenly" in w]
+    assert "/World/A by 1, 2, 4" in said
+    node = scene.node("/World/A")
+    point = torch.rand(50, 3, dtype=torch.float64)
+    expected = small_asset[0].shape.sdf(point).detach()  # the least scale is 1
+    stretch = real(1, 2, -4)
+    torch.testing.assert_close(sdf_world(node, stretch * point), expected, rtol=0, atol=1e-12)
+
+
+def test_a_stretched_object_is_written_and_edited_as_what_it_is(scene_file, asset_here, tmp_path):
+    scene = Scene.from_usd(scene_file(place({"scale": (1, 2, 4)})))
+    scene.to_usd(tmp_path / "again.usda")
+    again = Scene.from_usd(tmp_path / "again.usda")
+    assert_same_things(scene, again)
+    assert again.node("/World/A").body.shape.kind == "stretched"
+    moved = scene.moved("/World/A", (0.5, 0.0, 0.0), yaw_deg=30)
+    moved.save_edits(tmp_path / "edits.usda")
+    assert_same_things(moved, Scene.from_usd(tmp_path / "edits.usda"))
+    file = scene.export("/World/A", tmp_path / "alone")
+    alone = Scene.from_usd(
+        scene_file(f"""def "B" (references = @{file.relative_to(tmp_path)}@) {{}}""")
+    )
+    assert alone.node("/World/B").body.shape.kind == "neural"  # in its own frame, as it was learned
 
 
 def test_a_neural_object_keeps_its_distances_under_an_even_scale(

@@ -179,3 +179,16 @@ def test_results_write_themselves(metric, tmp_path):
     file = found.to_usd(tmp_path / "map.usda")
     rss = primvar(file, "/RadioMap", "rss_dbm")
     assert np.allclose(rss, found.best_dbm().reshape(-1).numpy(), rtol=1e-12, atol=0)
+
+
+def test_results_are_passed_over_without_a_word(metric, tmp_path):
+    """What shows results is meant to have no material; other scenery is still told of."""
+    read = Scene.from_usd(metric)
+    paths = Scene.from_usd(to_paths(read, tmp_path / "paths.usda"))
+    both = write_map(paths, tmp_path / "map.usda", VERTICES, FACES, np.array([-50.0, -60.0]))
+    assert Scene.from_usd(both).warnings == paths.warnings == read.warnings
+    other = both.read_text().replace("RadioMap", "Carpet").replace("bool results = 1", "")
+    carpet = tmp_path / "carpet.usda"
+    carpet.write_text(other)
+    (warning,) = set(Scene.from_usd(carpet).warnings) - set(read.warnings)
+    assert "/Carpet" in warning and "without radio material" in warning

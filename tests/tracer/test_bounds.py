@@ -17,7 +17,7 @@ from rfsg.scene.antennas import PATTERNS
 from rfsg.scene.patterns import Pattern
 from rfsg.scene.pose import Pose
 from rfsg.scene.radios import amplitude
-from rfsg.scene.scene import Node
+from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World
 from rfsg.tracer.bounds import CELLS, Floor, largest_amplitude, least_product, most_reflected
 from rfsg.tracer.faces import planes_of
@@ -200,3 +200,22 @@ def test_nothing_is_dropped_where_solids_bend_waves_or_nothing_can_be():
     assert ask(bending, quality) is None
     assert ask(bending, replace(quality, refraction=False)) is not None
     assert ask(World(scene), replace(quality, floor_db=-200.0)) is None
+
+
+def test_what_a_material_reflects_is_asked_anew_when_it_changes():
+    wall = Body(Box([0.1, 2.0, 1.0]), Slab(0.1, eps_r=2.7, sigma=0.005))
+    scene = Scene((Node("/wall", wall, Pose.at(0.0, 0.0, 0.0)),))
+    frequency, quality = vector(2.4e9), Quality()
+
+    def most():
+        world = World(scene)
+        return Floor(world, planes_of(world), frequency, quality).most
+
+    def plain():
+        return torch.stack([most_reflected(b, frequency) for b in World(scene).surfaces])
+
+    before = most()
+    assert torch.equal(before, plain()) and torch.equal(before, most())
+    with torch.no_grad():
+        wall.surface.medium.eps_r.mul_(1.5)  # as a fit does
+    assert torch.equal(most(), plain()) and not torch.equal(most(), before)

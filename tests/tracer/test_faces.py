@@ -8,7 +8,7 @@ from rfsg.objects.surfaces.interface import Conductor
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World
-from rfsg.tracer.faces import planes_of
+from rfsg.tracer.faces import _box_rectangles, _rectangles, planes_of
 from rfsg.tracer.prefixes import Prefixes, visible
 from tests.scenes import vector
 
@@ -74,3 +74,12 @@ def test_which_faces_may_come_next_against_a_plain_loop():
             highest = float((corners[face] @ faces.normal[k] - faces.offset[k]).max())
             if face == k or abs(highest) > 1e-9:  # faces that share an edge: as rounding has it
                 assert bool(found[row, face]) == (face != k and highest > 0)
+
+
+def test_boxes_are_laid_out_together_as_each_alone():
+    shapes = {k: Box([0.1 + k, 0.2, 3.0 - k]) for k in range(3)} | {7: Sphere(1.0)}
+    found = _box_rectangles(shapes)
+    assert list(found) == [0, 1, 2]
+    for key, columns in found.items():
+        for together, alone in zip(columns, _rectangles(shapes[key]), strict=True):
+            assert torch.equal(together, alone)

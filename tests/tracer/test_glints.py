@@ -11,18 +11,18 @@ from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World, unit
 from rfsg.tracer.faces import Looks, Samples, samples_of
-from rfsg.tracer.glances import astray, stationary
+from rfsg.tracer.glances import astray
 from rfsg.tracer.glints import ALIKE, BESIDE, NEAR, _good, glints, may_glint
 from rfsg.tracer.launch import fibonacci
 from rfsg.tracer.newton import Batch
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.sequences import enumerate_chains
-from rfsg.tracer.settle import Settling, _round, _start
-from rfsg.tracer.zone import Facets
+from rfsg.tracer.settle import Settling, _look, _start
 from tests.scenes import vector
 from tests.test_lab import ASSETS
 
 WAVELENGTH = 0.125
+STEPS = Quality().newton
 
 
 def _learned(name: str):
@@ -179,53 +179,8 @@ def test_every_object_of_a_shape_is_looked_at_as_if_it_were_alone():
 # the first look
 
 
-def _facets(offset, slope, bend) -> Facets:
-    m = len(offset)
-    one = torch.ones(m, dtype=torch.float64)
-    frame = torch.eye(3, dtype=torch.float64).expand(m, 3, 3)
-    zero = torch.zeros(m, 3, dtype=torch.float64)
-    return Facets(zero, frame, offset, slope, bend, 0.0 * one, one, 0.1 * one)
-
-
-def test_the_stationary_path_over_a_quadric():
-    """Its length has no slope there, by differences."""
-    generator = torch.Generator().manual_seed(3)
-    bend = 0.3 * torch.randn(30, 2, 2, generator=generator, dtype=torch.float64)
-    facets = _facets(
-        torch.zeros(30, dtype=torch.float64),
-        0.1 * torch.randn(30, 2, generator=generator, dtype=torch.float64),
-        -bend @ bend.mT,  # convex towards the ends: no caustic, one stationary path
-    )
-    ends = torch.randn(2, 30, 3, generator=generator, dtype=torch.float64)
-    ends[..., 2] = 3.0 + ends[..., 2].abs()
-    found, _ = stationary(facets, torch.zeros(30, 3, dtype=torch.float64), ends[0], ends[1])
-
-    def length(uv: torch.Tensor) -> torch.Tensor:
-        height = (facets.slope * uv).sum(-1)
-        height = height + 0.5 * torch.einsum("mi,mij,mj->m", uv, facets.bend, uv)
-        x = torch.cat([uv, height[:, None]], -1)
-        return (x - ends[0]).norm(dim=-1) + (x - ends[1]).norm(dim=-1)
-
-    torch.testing.assert_close(
-        found[:, 2],
-        (facets.slope * found[:, :2]).sum(-1)
-        + 0.5 * torch.einsum("mi,mij,mj->m", found[:, :2], facets.bend, found[:, :2]),
-    )
-    for k in (0, 1):
-        step = torch.zeros(2, dtype=torch.float64)
-        step[k] = 1e-5
-        slope = (length(found[:, :2] + step) - length(found[:, :2] - step)) / 2e-5
-        assert float(slope.abs().max()) < 1e-7
-
-
-def test_a_plane_mirrors_where_the_image_method_says():
-    flat = _facets(*(torch.zeros(1, *s, dtype=torch.float64) for s in ((), (2,), (2, 2))))
-    fore, aft = vector(0.0, 0.0, 1.0)[None], vector(4.0, 2.0, 3.0)[None]
-    found, _ = stationary(flat, torch.zeros(1, 3, dtype=torch.float64), fore, aft)
-    torch.testing.assert_close(found, vector(1.0, 0.5, 0.0)[None])
-
-
-def test_a_first_look_leaves_glints_on_a_flat_side_and_drops_those_far_past_it():
+@pytest.mark.parametrize("lone", [True, False])
+def test_a_first_look_leaves_glints_on_a_flat_side_and_drops_those_far_past_it(lone):
     """The cabinet's front: mirrors of its middle stay; of a point metres beside it, they go."""
     shape = _learned("cabinet")
     looks = Looks(shape, torch.device("cpu"), WAVELENGTH)
@@ -237,25 +192,26 @@ def test_a_first_look_leaves_glints_on_a_flat_side_and_drops_those_far_past_it()
     side = torch.linalg.cross(normal, vector(0.0, 0.0, 1.0)[None])
     foot = looks.point[sample]
     fore, aft = foot + 3.0 * normal + side, foot + 3.0 * normal - side
-    assert not bool(astray(looks, sample, fore, aft))
+    assert not bool(astray(looks, sample, fore, aft, STEPS, lone))
     beside = foot + 3.0 * normal + 9.0 * side, foot + 3.0 * normal + 7.0 * side
-    assert bool(astray(looks, sample, *beside))
+    assert bool(astray(looks, sample, *beside, STEPS, lone))
 
 
+@pytest.mark.parametrize("lone", [True, False])
 @pytest.mark.parametrize("name", ["cabinet", "person"])
 @torch.no_grad()
-def test_what_a_first_look_drops_settling_would_give_up_at_once(name):
+def test_what_a_first_look_drops_settling_would_give_up_at_once(name, lone):
     """The plain twin: each candidate as a chain, after the first look that settling takes itself."""
     shape = _learned(name)
     item, looks = _samples(shape), Looks(shape, torch.device("cpu"), WAVELENGTH)
     fore, aft = _images(item, 80, seed=5)
     pair, sample = glints(item, fore, aft)
-    dropped = astray(looks, sample, fore[pair], aft[pair])
+    dropped = astray(looks, sample, fore[pair], aft[pair], STEPS, lone)
     assert bool(dropped.any()) and not bool(dropped.all())
     node = Node("/item", Body(shape, Conductor()), Pose.identity())
     world, none = World(Scene((node,))), torch.zeros(len(pair), 1, dtype=torch.int64)
     x = item.point[sample][:, None]
     batch = Batch(pair, fore[pair], aft[pair], none, item.patch[sample][:, None], x)
     settling = Settling(world, WAVELENGTH, Quality())
-    left, _ = _round(settling, batch, _start(world, batch), torch.arange(len(pair)), look=True)
+    left = _look(settling, batch, _start(batch))
     assert not bool(dropped[left].any())

@@ -3,12 +3,20 @@
 import pytest
 import torch
 
-from rfsg.scene.scene import Scene, SceneError
+from rfsg.objects.body import Body
+from rfsg.objects.physics.lobes import Scattering
+from rfsg.objects.shapes.analytic import Box
+from rfsg.objects.surfaces.slab import Slab
+from rfsg.scene.pose import Pose
+from rfsg.scene.scene import Node, Scene, SceneError
+from rfsg.scene.world import World
+from rfsg.tracer.cells import grid_on
 from rfsg.tracer.montecarlo import COPIES, estimate_power
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.radiomap import RadioMap, radio_map
+from rfsg.tracer.rounds import Rounds
 from rfsg.tracer.tally import Tally, in_db
-from tests.scenes import room
+from tests.scenes import radio, room, room_nodes
 
 QUALITY = Quality(depth=1, map_rays=8_000, floor_db=-100.0)
 OPTIONS = dict(bounds=(0.0, 0.0, 6.0, 4.0), cell=1.0, quality=QUALITY)
@@ -112,3 +120,24 @@ def test_a_map_of_many_cells_does_not_depend_on_the_portions(monkeypatch):
     assert torch.allclose(*maps, rtol=1e-12, atol=0.0)
     images = radio_map(room(), 2.4e9, method="images", **options).path_gain
     assert torch.allclose(images, maps[0], rtol=1e-10, atol=0.0)
+
+
+@torch.no_grad()
+def test_lattices_that_fly_together_are_those_that_fly_alone():
+    """Two transmitters and a rough slab, so that dice are thrown: company changes nothing."""
+    slab = Slab(0.2, eps_r=5.24, sigma=0.05, scattering=Scattering(0.6))
+    rough = Node("/rough", Body(Box((1.0, 0.1, 1.0)), slab), Pose.at(3.0, 3.0, 1.0))
+    senders = (radio("/tx0", 1.3, 2.1, 1.7), radio("/tx1", 4.6, 1.2, 1.1))
+    scene = Scene((*room_nodes(), rough), senders, (), 2.4e9)
+    quality = Quality(depth=2, diffuse=1, map_rays=4_000, floor_db=-100.0)
+    world, frequency = World(scene), torch.tensor([2.4e9], dtype=torch.float64)
+    cells = grid_on(Pose.at(0.0, 0.0, 1.2), (0.0, 0.0, 6.0, 4.0), 1.0)
+    alone, together = (Rounds(world, frequency, quality, 7, cells) for _ in range(2))
+    for _ in range(5):
+        alone.add()
+    together.add(2)
+    together.add(3)
+    assert together.count == alone.count == 5
+    for one, other in zip(alone.summary(), together.summary(), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-11, atol=0)
+    assert not torch.equal(*together.summary()[0])

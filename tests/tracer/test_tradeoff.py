@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from rfsg import plot
+from rfsg.objects.shapes.band import WAYS
+from rfsg.objects.shapes.kept import BAKE_AFTER
 from rfsg.plot_tradeoff import LEAST_ERROR_DB, drawn_error_db, tradeoff_figure
 from rfsg.tracer import tradeoff as measuring
 from rfsg.tracer.compared import Difference, difference, first_arrival, missed, see
@@ -114,6 +116,33 @@ def test_settings_change_one_field_and_never_repeat_the_base():
     assert small["depth 4"] == replace(base, depth=4) and "depth 2" not in small
 
 
+def test_the_ways_to_meet_a_shape_are_asked_where_one_is_learned():
+    """All by as many rays, so that only the way differs; the march on the network by one fewer."""
+    base = Quality()
+    learned, planar = (dict(settings(base, "small", learned)) for learned in (True, False))
+    extra = [learned[name] for name in learned if name not in planar]
+    assert {q.intersection for q in extra} == set(WAYS)
+    assert {q.rays for q in extra} == {BAKE_AFTER - 1, BAKE_AFTER}
+    assert all(q.search == "rays" for q in extra)
+
+
+@pytest.mark.parametrize("base", [Quality(), Quality.named("draft"), Quality(search="rays")])
+def test_what_is_expected_to_be_quick_comes_first(base):
+    (name, first), *rest = settings(base, "full")
+    assert name == "base" and first == base and measuring.times(base, base) == 1.0
+    expected = [measuring.times(quality, base) for _, quality in rest]
+    assert expected == sorted(expected)
+
+
+def test_more_of_a_field_that_costs_is_expected_to_take_longer():
+    base = Quality(diffraction=1)
+    for name in measuring.DEARER:
+        more = replace(base, **{name: getattr(base, name) + 1})
+        assert measuring.times(more, base) == pytest.approx(measuring.DEARER[name])
+        assert measuring.times(base, more) == pytest.approx(1.0 / measuring.DEARER[name])
+    assert measuring.times(replace(base, search="rays", rays=measuring.RAYS_ALIKE), base) == 2.0
+
+
 # a run
 
 
@@ -145,6 +174,23 @@ class Clock:
             options["progress"](stage)
             self.now += 1.0
         return simulate(scene, frequency, Quality(depth=1))
+
+
+def test_what_would_take_too_long_is_left_out_alone(monkeypatch):
+    """A setting that does not fit keeps none of those after it from being run."""
+    clock = Clock()
+    monkeypatch.setattr(measuring, "time", clock)
+    dear = Quality(depth=2, diffraction=2)
+    offered = [
+        ("base", Quality(depth=2)),
+        ("dear", dear),
+        ("cheap", Quality(depth=2, floor_db=-30.0)),
+    ]
+    monkeypatch.setattr(measuring, "settings", lambda *_: offered)
+    scene = room(receivers=((3.31, 0.71, 1.93),))
+    found = tradeoff(scene, base=Quality(depth=2), budget_s=60.0, run=clock.run)
+    assert {"base", "cheap"} <= {o.setting for o in found.outcomes}
+    assert any(s.startswith("dear: would take some 2.4e+02 s") for s in found.left_out)
 
 
 @pytest.mark.parametrize("budget", [20.0, 40.0])

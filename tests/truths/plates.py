@@ -2,23 +2,21 @@
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
 
 from rfsg.objects.body import Body
 from rfsg.objects.surfaces.interface import Conductor
-from rfsg.scene.assets import load_asset
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene
 from rfsg.tracer.channel import coefficients
 from rfsg.tracer.plan import Quality
 from rfsg.tracer.simulate import simulate
+from tests import shipped
 from tests.scenes import box_node, radio
 from tests.tracer.shapes import Field, rippled
 
-ASSETS = Path(__file__).resolve().parents[2] / "assets"
 C = 299_792_458.0
 
 
@@ -70,7 +68,7 @@ def _physical_optics(x, y, z, tx, rx, k, window):
 
 def trained(frequency) -> Compared:
     """The cabinet's face over a flat one: by the tracer, and by the integral over either."""
-    cabinet = load_asset(ASSETS / "objects" / "cabinet" / "cabinet.usda").body.shape
+    cabinet = shipped.shape("cabinet")
     k, (half, step) = 2 * math.pi * frequency / C, PATCHES[frequency]
     mirrors, found = zip(
         *(

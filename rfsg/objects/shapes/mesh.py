@@ -119,10 +119,13 @@ class Mesh(nn.Module):
         area = weight.new_zeros(self._faces).index_add(0, self.face, weight)
         return torch.cat([normal, (offset / area)[:, None]], 1)
 
-    @torch.no_grad()
     def rectangles(self) -> tuple[Tensor, Tensor, Tensor]:
         """For each face the centre [k 3], unit edges [k 2 3] and half sides [k 2] of a rectangle in
         its plane that holds it, one side along the face's longest edge: where to look for it."""
+        return self._kept("rectangles", self._about_faces)
+
+    @torch.no_grad()
+    def _about_faces(self) -> tuple[Tensor, Tensor, Tensor]:
         planes = self.planes()
         normal = planes[:, :3]
         start, along = self.vertices[self.ends].unbind(1)

@@ -15,6 +15,8 @@ def triangles_of(
     Triangles stay as they are, plane quads without an inward corner are cut in two, and everything
     else is triangulated by manifold3d in its mean plane. Corners in a row on one line are allowed.
     """
+    if (count == 3).all():
+        return index.reshape(-1, 3)
     first = np.cumsum(count) - count
     three = index[first[count == 3, None] + np.arange(3)]
     quad = index[first[count == 4, None] + np.arange(4)]

@@ -16,11 +16,10 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from rfsg.objects.contract import Jet
-from rfsg.objects.shapes import topology
 from rfsg.objects.shapes.mesh import CHUNK, INSIDE, Mesh, beside_segments
+from rfsg.objects.shapes.sheet_soup import Soup, soups
 
 HALF = 1e-5  # [m] half of what a sheet is drawn with: a path is off by a five-hundredth of 1 cm at most
-SINGLE = 4.0 * 2.0**-23  # relative: what single precision leaves of a coordinate, a few times over
 LEVEL_LINE = 1e-12  # sine between a line and a plane that it never meets
 RIM = 1e-9  # of a triangle's sides: neighbours overlap by so much, and no line slips between
 
@@ -66,28 +65,27 @@ class Sheet(Mesh):
         triangles: Sequence[Sequence[int]] | ndarray | Tensor,
         sheet: bool = True,
     ):
+        (soup,) = soups([(np.asarray(vertices), np.asarray(triangles))])
+        if isinstance(soup, ValueError):
+            raise soup
+        self._take(soup)
+
+    @classmethod
+    def of(cls, soup: Soup) -> "Sheet":
+        """The sheet of a soup; of many sheets those are made at once (``sheet_soup.soups``)."""
+        sheet = object.__new__(cls)
+        sheet._take(soup)
+        return sheet
+
+    def _take(self, soup: Soup) -> None:
         nn.Module.__init__(self)
         self._tables = {}
-        place, corner = _cleaned(np.asarray(vertices), np.asarray(triangles))
-        segments, owner, wedges = _wedges(place, corner)
-        both = np.concatenate([corner, corner[:, ::-1]])
-        size = float(np.linalg.norm(np.ptp(place, axis=0)))
-        level = max(topology.LEVEL * size, SINGLE * float(np.abs(place).max()))
-        face = topology._flat(place, both, wedges, level)
-        self.vertices = nn.Parameter(torch.from_numpy(place), requires_grad=False)
-        named = {
-            "triangles": both,
-            "face": face,
-            "ends": wedges[:, :2],
-            "sides": wedges[:, 2:],
-            "segments": segments,
-            "triangle_of_segment": owner,
-        }
-        for name, array in named.items():
-            tensor = torch.from_numpy(np.ascontiguousarray(array))
+        self.vertices = nn.Parameter(torch.from_numpy(soup.vertices), requires_grad=False)
+        for name in ("triangles", "face", "ends", "sides", "segments", "triangle_of_segment"):
+            tensor = torch.from_numpy(np.ascontiguousarray(getattr(soup, name)))
             self.register_buffer(name, tensor, persistent=False)
         self.convex = False
-        self._count = len(corner)
+        self._count = len(soup.triangles) // 2
 
     def config(self) -> dict[str, object]:
         """Constructor arguments, ready for JSON: those of ``Mesh``, which makes a sheet of them."""
@@ -169,16 +167,26 @@ class Sheet(Mesh):
     @torch.no_grad()
     def patch(self, point: Float[Tensor, "*b 3"]) -> Int[Tensor, "*b"]:
         flat = point.reshape(-1, 3)
-        square, triangle = self._above_them(flat).min(1)
+        square, triangle = self._nearest_above(flat)
         # what lies on the sheet lies on a triangle; only beside one are segments looked at
         i = torch.nonzero(square > (2.0 * HALF) ** 2).squeeze(-1)
         if len(i):
-            feature, _ = self._search(flat[i])
+            feature, _ = self._rows(i)._search(flat[i])
             beside = self.triangle_of_segment[(feature - self._count).clamp(min=0)]
             triangle[i] = torch.where(feature < self._count, feature, beside)
         plane = self._drawn.plane[triangle].to(flat)
         below = (flat * plane[:, :3]).sum(-1) < plane[:, 3]
         return self.face[triangle + self._count * below].reshape(point.shape[:-1])
+
+    def _rows(self, rows: Int[Tensor, "k"]) -> Mesh:
+        """What some rows of a batch ask: of one sheet, all of them the same."""
+        return self
+
+    def _nearest_above(self, point: Float[Tensor, "m 3"]) -> tuple[Tensor, Tensor]:
+        """Square of the distance to, and number of, the nearest triangle that points stand above or below;
+        inf where there is none."""
+        square, triangle = self._above_them(point).min(1)
+        return square, triangle
 
     def _above_them(self, point: Float[Tensor, "m 3"]) -> Float[Tensor, "m t"]:
         """Square of the distance to triangles that points stand above or below; else inf."""
@@ -218,33 +226,35 @@ class Sheet(Mesh):
         for i in torch.arange(len(length), device=length.device).split(
             max(1, CHUNK // self._count)
         ):
-            row, enter, leave = self._in_prisms(origin[i].double(), direction[i].double())
+            forms = self._drawn.forms(origin[i].double()), self._drawn.rates(direction[i].double())
+            row, enter, leave = in_prisms(*forms)
             enter, leave = enter.clamp(min=0.0), torch.minimum(leave, length[i[row]].double())
             through = leave > enter
             parts.append((i[row[through]], enter[through], leave[through]))
         if not parts:
             none = length.new_zeros(0, dtype=torch.float64)
             return none.long(), none, none
-        return _united(*(torch.cat(column) for column in zip(*parts, strict=True)))
-
-    def _in_prisms(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(row, enter, leave) of lines in the prisms over single triangles: where the height is within
-        a half and no share is negative."""
-        drawn = self._drawn
-        value, rate = drawn.forms(origin), drawn.rates(direction)
-        least = value.new_tensor([-HALF, -RIM, -RIM, -RIM])[:, None]
-        most = value.new_tensor([HALF, torch.inf, torch.inf, torch.inf])[:, None]
-        still = rate.abs() < LEVEL_LINE
-        safe = torch.where(still, 1.0, rate)
-        ends = (least - value) / safe, (most - value) / safe
-        always = torch.where((value >= least) & (value <= most), torch.inf, -torch.inf)
-        since = torch.where(still, -always, torch.minimum(*ends)).amax(1)
-        until = torch.where(still, always, torch.maximum(*ends)).amin(1)
-        row, k = torch.nonzero(until > since, as_tuple=True)
-        return row, since[row, k], until[row, k]
+        return united(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 
-def _united(row: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def in_prisms(
+    value: Float[Tensor, "m 4 t"], rate: Float[Tensor, "m 4 t"]
+) -> tuple[Int[Tensor, "k"], Float[Tensor, "k"], Float[Tensor, "k"]]:
+    """(row, enter, leave) of lines in the prisms over single triangles, by the triangles' forms at their
+    origins and how they change along them: where the height is within a half and no share is negative."""
+    least = value.new_tensor([-HALF, -RIM, -RIM, -RIM])[:, None]
+    most = value.new_tensor([HALF, torch.inf, torch.inf, torch.inf])[:, None]
+    still = rate.abs() < LEVEL_LINE
+    safe = torch.where(still, 1.0, rate)
+    ends = (least - value) / safe, (most - value) / safe
+    always = torch.where((value >= least) & (value <= most), torch.inf, -torch.inf)
+    since = torch.where(still, -always, torch.minimum(*ends)).amax(1)
+    until = torch.where(still, always, torch.maximum(*ends)).amin(1)
+    row, k = torch.nonzero(until > since, as_tuple=True)
+    return row, since[row, k], until[row, k]
+
+
+def united(row: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Stretches of rows, those that overlap or lie within a sheet's thickness of each other as one."""
     order = torch.argsort(enter, stable=True)
     order = order[torch.argsort(row[order], stable=True)]
@@ -257,78 +267,3 @@ def _united(row: Tensor, enter: Tensor, leave: Tensor) -> tuple[Tensor, Tensor, 
     group = torch.cumsum(begins, 0) - 1
     last = leave.new_full((int(begins.sum()),), -torch.inf)
     return row[begins], enter[begins], last.scatter_reduce(0, group, leave, "amax")
-
-
-def _checked(vertices: ndarray, triangles: ndarray) -> tuple[ndarray, ndarray]:
-    """The arrays as float64 and int64. Raises ValueError for what they cannot be."""
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-        raise ValueError(f"vertices of shape {vertices.shape}: expected finite rows x, y, z [m]")
-    most = topology.MAX_TRIANGLES
-    whole = triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype.kind in "iu"
-    if not whole or not 1 <= len(triangles) <= most:
-        raise ValueError(
-            f"triangles of shape {triangles.shape}: expected 1 to {most} rows of three vertex "
-            "numbers; divide a larger sheet into pieces"
-        )
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise ValueError(f"triangles name vertices outside of 0 to {len(vertices) - 1}")
-    return vertices.astype(np.float64), triangles.astype(np.int64)
-
-
-def _cleaned(vertices: ndarray, triangles: ndarray) -> tuple[ndarray, ndarray]:
-    """Corners at one place welded; triangles that have an area, each once."""
-    vertices, triangles = _checked(vertices, triangles)
-    place, index = np.unique(vertices, axis=0, return_inverse=True)
-    corner = index.reshape(-1)[triangles]
-    size = float(np.linalg.norm(np.ptp(place, axis=0)))
-    longest = np.linalg.norm(place[corner] - place[np.roll(corner, 1, 1)], axis=-1).max(1)
-    area = topology.facets(place, corner)[1]
-    # a needle's normal is rounding: its height over its longest side must be more than that
-    corner = corner[(area > topology.EMPTY * size**2) & (area > SLIVER * longest**2)]
-    _, first = np.unique(np.sort(corner, 1), axis=0, return_index=True)
-    corner = corner[np.sort(first)]
-    if not len(corner):
-        raise ValueError("a sheet without a triangle that has an area")
-    used, corner = np.unique(corner, return_inverse=True)
-    return place[used], corner.reshape(-1, 3)
-
-
-SLIVER = 1e-6  # area over longest side squared
-
-
-def _wedges(
-    place: Float[ndarray, "v 3"], corner: Int[ndarray, "t 3"]
-) -> tuple[Int[ndarray, "s 2"], Int[ndarray, "s"], Int[ndarray, "w 4"]]:
-    """Segments [s 2] of a soup of triangles with a triangle of each, and the wedges of air about them:
-    (vertex, vertex, side, side) as ``topology`` lists edges; side i + t is triangle i turned over.
-
-    About a segment e the triangles stand at angles; from one to the next, counter-clockwise, is a wedge.
-    It begins at the side whose normal is e x w, w pointing away from e in the triangle, and ends at the
-    side of the next whose normal is opposite. A lone triangle's two sides look into one wedge.
-    """
-    t = len(corner)
-    ends = np.concatenate([np.roll(corner, -k, 1)[:, :2] for k in range(3)])
-    third = np.concatenate([np.roll(corner, -k, 1)[:, 2] for k in range(3)])
-    triangle = np.tile(np.arange(t), 3)
-    segments, first, which = np.unique(
-        np.sort(ends, 1), axis=0, return_index=True, return_inverse=True
-    )
-    which = which.reshape(-1)
-    along = place[segments[:, 1]] - place[segments[:, 0]]
-    along = along / np.linalg.norm(along, axis=1, keepdims=True)
-    axis = np.eye(3)[np.abs(along).argmin(1)]
-    right = np.cross(along, axis)
-    right = right / np.linalg.norm(right, axis=1, keepdims=True)
-    up = np.cross(along, right)
-    away = place[third] - place[segments[which, 0]]
-    angle = np.arctan2((away * up[which]).sum(1), (away * right[which]).sum(1))
-    order = np.lexsort((angle, which))
-    begin = np.searchsorted(which[order], np.arange(len(segments) + 1))
-    following = np.arange(len(order)) + 1
-    following[begin[1:] - 1] = begin[:-1]
-    # wound along the segment, a triangle as given has the normal e x w
-    wound = ends[:, 0] == segments[which, 0]
-    start = np.where(wound, triangle, triangle + t)[order]
-    stop = np.where(wound, triangle + t, triangle)[order][following]
-    pairs = np.concatenate([segments[which[order]], start[:, None], stop[:, None]], 1)
-    return segments, triangle[first], pairs

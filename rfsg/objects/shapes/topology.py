@@ -52,7 +52,7 @@ def closed_mesh(vertices: ndarray, triangles: ndarray) -> Topology:
         corner = corner[:, ::-1].copy()
         pairs[:, :2] = pairs[:, 1::-1]
     return Topology(
-        place, corner, pairs[:, :2], pairs[:, 2:], _flat(place, corner, pairs, LEVEL * size)
+        place, corner, pairs[:, :2], pairs[:, 2:], flat_faces(place, corner, pairs, LEVEL * size)
     )
 
 
@@ -101,14 +101,21 @@ def _volume(place: ndarray, corner: ndarray) -> float:
     return float((a * np.cross(b, c)).sum() / 6.0)
 
 
-def _flat(place: ndarray, corner: ndarray, pairs: ndarray, most: float) -> Int[ndarray, "t"]:
-    """The flat face of each triangle: those that hang together in one plane."""
+def flat_faces(
+    place: Float[ndarray, "v 3"],
+    corner: Int[ndarray, "t 3"],
+    pairs: Int[ndarray, "e 4"],
+    most: float | Float[ndarray, "t"],
+) -> Int[ndarray, "t"]:
+    """The flat face of each triangle: those that hang together in one plane, none of whose corners is off
+    it by more than ``most`` [m]."""
+    most = np.broadcast_to(most, len(corner))
     normal, area = facets(place, corner)
     first, second = pairs[:, 2], pairs[:, 3]
     height = np.abs(
         ((place[corner[second]] - place[corner[first, 0]][:, None]) * normal[first, None]).sum(-1)
     )
-    level = (height.max(1) <= most) & ((normal[first] * normal[second]).sum(1) > 0)
+    level = (height.max(1) <= most[first]) & ((normal[first] * normal[second]).sum(1) > 0)
     face = components(len(corner), pairs[level, 2:])
     total = np.zeros((int(face.max()) + 1, 3))
     np.add.at(total, face, area[:, None] * normal)

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils
 
+from rfsg.objects.body import unstretched
 from rfsg.objects.contract import Surface
 from rfsg.scene.fields import FREQUENCY, RADIO, VELOCITY
 from rfsg.scene.materials import Material, material_of
@@ -107,17 +108,18 @@ class Author:
 
     def _asset(self, node: Node, material: Material | None) -> tuple[Path, bool]:
         """(asset file that holds a node's object, whether it holds its surface too)."""
+        body, _ = unstretched(node.body)
         if node.asset is not None and Path(node.asset).is_file():
             if node.asset not in self.records:
                 self.records[node.asset] = read_asset(Path(node.asset))
             record = self.records[node.asset]
-            own, same = record.holds(node.body, otherwise_bound=material is not None)
+            own, same = record.holds(body, otherwise_bound=material is not None)
             if same and record.referable:
                 return Path(node.asset).absolute(), own
         if id(node.body) not in self.saved:
             file = self._beside(node.path.split("/")[-1], ".usda")
             self.written += [file, file.with_suffix(".safetensors")]
-            write_asset(file, node.body, name=file.stem, overwrite=self.overwrite)
+            write_asset(file, body, name=file.stem, overwrite=self.overwrite)
             self.saved[id(node.body)] = file
         return self.saved[id(node.body)], True
 
@@ -211,7 +213,7 @@ class Author:
         prim = self.stage.GetPrimAtPath(thing.path)
         pose, here = _pose(thing), self._places().matrix(prim)
         if old is None or thing.path in self.swapped or thing.path not in self.before:
-            wanted = _matrix(pose)
+            wanted = _matrix(pose) @ _stretch(thing)
         elif alike(pose, was := _pose(old)):
             wanted = self.before[thing.path]
         else:
@@ -311,6 +313,12 @@ def _pose(thing: Node | Radio) -> Pose:
     if isinstance(thing, Node):
         return thing.pose
     return Pose(thing.rotation, thing.position, torch.ones((), dtype=torch.float64))
+
+
+def _stretch(thing: Node | Radio) -> np.ndarray:
+    """What its transform does to a thing besides its pose: a learned object may be stretched."""
+    scales = as_numpy(unstretched(thing.body)[1]) if isinstance(thing, Node) else np.ones(3)
+    return np.diag([*scales, 1.0])
 
 
 def _matrix(pose: Pose) -> np.ndarray:

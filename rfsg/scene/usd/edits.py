@@ -14,6 +14,7 @@ from typing import Any
 
 from pxr import Sdf, Usd, UsdUtils
 
+from rfsg.objects.body import unstretched
 from rfsg.scene import files
 from rfsg.scene.materials import material_of
 from rfsg.scene.pose import Pose
@@ -215,9 +216,10 @@ def _differences(meant: Any, read: Any) -> Iterator[str]:
 
 def _same_shape(meant: Node, read: Node) -> bool:
     """Bit by bit, or, for known shapes, sizes in the world: those absorb a scale when they are read."""
-    one, other = meant.body.shape, read.body.shape
+    (body, scales), (also, others) = unstretched(meant.body), unstretched(read.body)
+    one, other = body.shape, also.shape
     if same_bits(one, other):
-        return _near(meant.pose.scale, read.pose.scale)
+        return _near(meant.pose.scale * scales, read.pose.scale * others)
     left, right = _lengths(one, meant.pose), _lengths(other, read.pose)
     return (
         one.kind == other.kind != "neural"

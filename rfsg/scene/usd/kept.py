@@ -45,6 +45,10 @@ class Kept:
             self.now[key] = self.before[key] if key in self.before else make()
         return self.now[key]
 
+    def holds(self, key: Hashable) -> bool:
+        """Whether ``of`` has the thing already."""
+        return key in self.now or key in self.before
+
     def same(self, key: Hashable, new: Any) -> Any:
         """The record of the reading before, if the new one says the same, else the new one."""
         old = self.now.get(key, self.before.get(key))

@@ -4,6 +4,9 @@ A mesh is a closed solid, unless its customData say that it is a sheet: ``rfsg =
 """
 
 import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,6 +16,7 @@ from pxr import Usd, UsdGeom, UsdShade, Vt
 from rfsg.objects.shapes.mesh import Mesh
 from rfsg.objects.shapes.polygons import triangles_of
 from rfsg.objects.shapes.sheet import Sheet
+from rfsg.objects.shapes.sheet_soup import soups
 from rfsg.objects.shapes.topology import MAX_TRIANGLES
 from rfsg.scene.fields import MESH_POINTS
 from rfsg.scene.scene import SceneError
@@ -20,9 +24,26 @@ from rfsg.scene.usd.attributes import author, values_of
 from rfsg.scene.usd.kept import Kept
 
 
-def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray, shared: str, kept: Kept) -> Mesh:
-    """The shape of a mesh prim, ``scales`` [3] absorbed; the same for equal arrays under one key
-    ``shared``. Raises SceneError for what is no solid."""
+@dataclass(frozen=True)
+class MeshRead:
+    """The arrays of a mesh prim, from which its shape is made; and the key under which it is kept."""
+
+    where: str
+    point: ndarray  # [v 3] in the prim's units, of which ``scales`` [3] make metres
+    count: ndarray
+    index: ndarray
+    scales: ndarray
+    sheet: bool
+    key: str
+
+    def arrays(self) -> tuple[ndarray, ndarray]:
+        """Vertices [v 3] m and triangles [t 3]. Raises ValueError."""
+        return self.point * self.scales, triangles_of(self.point, self.count, self.index)
+
+
+def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray, shared: str) -> MeshRead:
+    """What a mesh prim says; equal arrays under one ``shared`` have one key. Raises SceneError for arrays
+    that are no mesh."""
     where = str(prim.GetPath())
     point, count, index = (_array(prim, name, time) for name in NAMES)
     if faults := _amiss(point, count, index):
@@ -34,16 +55,40 @@ def read_mesh(prim: Usd.Prim, time: Usd.TimeCode, scales: ndarray, shared: str, 
         point = exact
     sheet = is_sheet(prim)
     key = ("mesh", shared, str(sheet), *(a.tobytes() for a in (scales, point, count, index)))
-    try:
-        return kept.of(
-            digest_of(key),
-            lambda: Mesh(point * scales, triangles_of(point, count, index), sheet=sheet),
-        )
-    except ValueError as error:
-        raise SceneError(
-            [f"{where}: no solid for waves: {error}. A shape that is not closed can be repaired and "
-             "learned with `rfsg learn-shape`, or be a sheet: customData rfsg:sheet = true"]
-        ) from error  # fmt: skip
+    return MeshRead(where, point, count, index, scales, sheet, digest_of(key))
+
+
+def shapes_of(meshes: Sequence[MeshRead], kept: Kept) -> dict[str, Mesh | SceneError]:
+    """The shape of each mesh by its key, or why there is none. Sheets are made all at once: a city is
+    thousands, of a few triangles each."""
+    made: dict[str, Mesh | SceneError] = {}
+    sheets: dict[str, tuple[ndarray, ndarray]] = {}
+    for mesh in {m.key: m for m in meshes}.values():
+        try:
+            if mesh.sheet and not kept.holds(mesh.key):
+                sheets[mesh.key] = mesh.arrays()
+            else:
+                made[mesh.key] = kept.of(mesh.key, partial(_solid, mesh))
+        except ValueError as error:
+            made[mesh.key] = _no_solid(mesh, error)
+    where = {mesh.key: mesh for mesh in meshes}
+    for key, soup in zip(sheets, soups(list(sheets.values())), strict=True):
+        if isinstance(soup, ValueError):
+            made[key] = _no_solid(where[key], soup)
+        else:
+            made[key] = kept.of(key, partial(Sheet.of, soup))
+    return made
+
+
+def _solid(mesh: MeshRead) -> Mesh:
+    return Mesh(*mesh.arrays(), sheet=mesh.sheet)
+
+
+def _no_solid(mesh: MeshRead, why: ValueError) -> SceneError:
+    return SceneError(
+        [f"{mesh.where}: no solid for waves: {why}. A shape that is not closed can be repaired and "
+         "learned with `rfsg learn-shape`, or be a sheet: customData rfsg:sheet = true"]
+    )  # fmt: skip
 
 
 SHEET = {"rfsg": {"sheet": True}}  # customData of a mesh without an inside

@@ -8,7 +8,6 @@ import torch
 from pxr import Usd, UsdGeom
 
 from rfsg.scene.fields import VELOCITY
-from rfsg.scene.pose import Pose
 from rfsg.scene.scene import SceneError
 from rfsg.scene.transforms import Placement, broken, decompose
 from rfsg.scene.usd.attributes import values_of
@@ -58,13 +57,6 @@ class Places:
             return decompose(self.matrix(prim))
         except ValueError as error:
             raise SceneError([f"{prim.GetPath()}: {error}"]) from error
-
-    def uniform(self, prim: Usd.Prim, factor: float) -> Pose:
-        placement = self.placement(prim)
-        try:
-            return placement.pose(placement.uniform() * factor)
-        except ValueError as error:
-            raise SceneError([f"{prim.GetPath()}: a neural object cannot be {error}"]) from error
 
     def velocity(self, prim: Usd.Prim) -> torch.Tensor:
         """[m/s] in the world: as authored, else from the time samples of its transforms."""

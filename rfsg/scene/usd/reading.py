@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ from pxr import Sdf, Usd, UsdGeom
 
 from rfsg.objects.body import Body
 from rfsg.objects.catalogue import shape_class
+from rfsg.objects.contract import Surface
+from rfsg.objects.shapes.stretched import stretched
 from rfsg.scene import files
 from rfsg.scene.fields import FIELDS, FREQUENCY, NEURAL, SHAPE
 from rfsg.scene.materials import Material
 from rfsg.scene.pose import Pose
 from rfsg.scene.scene import Node, Scene, SceneError
+from rfsg.scene.transforms import Placement
 from rfsg.scene.usd import shapes
 from rfsg.scene.usd.attributes import values_of
 from rfsg.scene.usd.composition import sublayer_warnings, unit_faults
@@ -24,7 +28,7 @@ from rfsg.scene.usd.faults import PXR_ERRORS, attempt, one_line, pxr_words, quie
 from rfsg.scene.usd.kept import Kept
 from rfsg.scene.usd.layers import asset_path
 from rfsg.scene.usd.materials import Materials
-from rfsg.scene.usd.meshes import read_mesh, smoothed
+from rfsg.scene.usd.meshes import MeshRead, read_mesh, shapes_of, smoothed
 from rfsg.scene.usd.objects import WEIGHTS, asset_file, asset_metre, band_of, weights_bytes
 from rfsg.scene.usd.placements import Places, world_from_stage
 from rfsg.scene.usd.radios import Radios
@@ -32,6 +36,7 @@ from rfsg.scene.usd.source import Opened, Options, Source, opened
 from rfsg.scene.weights import FORMAT_VERSION, unpack
 
 MAX_PRIMS = 200_000
+RESULTS = "rfsg:results"  # in customData: a prim that shows results, and is no part of the scene
 SHOWN = 12  # paths named in a warning before "and more"
 
 
@@ -91,6 +96,17 @@ def examine(
     return list(dict.fromkeys(faults))
 
 
+@dataclass(frozen=True)
+class Waiting:
+    """A mesh that was found, and after how many of the other nodes."""
+
+    before: int
+    prim: Usd.Prim
+    read: MeshRead
+    surface: Surface
+    pose: Pose
+
+
 @dataclass
 class Reader:
     """The state of one read. Faults gather here: a prim at fault is left out, reading goes on."""
@@ -101,8 +117,10 @@ class Reader:
     faults: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     nodes: list[Node] = field(default_factory=list)
+    meshes: "list[Waiting]" = field(default_factory=list)
     decor: list[str] = field(default_factory=list)
     cages: list[str] = field(default_factory=list)
+    stretched: list[str] = field(default_factory=list)
     weights: dict[tuple[str, str, Any], Body] = field(default_factory=dict)
     asset_root: Sdf.Path = Sdf.Path.emptyPath  # the neural object that the traversal is inside of
 
@@ -126,6 +144,9 @@ class Reader:
             self.warnings.append(
                 _named("prim(s) without radio material, not seen by waves", self.decor)
             )
+        if self.stretched:
+            what = "learned object(s) scaled unevenly, other than what was learned"
+            self.warnings.append(_named(what, self.stretched))
         if self.cages:
             what = "mesh(es) to be subdivided, of which waves see the cage"
             self.warnings.append(_named(what, self.cages))
@@ -157,6 +178,7 @@ class Reader:
                     self.faults += error.faults
                 except PXR_ERRORS as error:
                     self.faults.append(f"{prim.GetPath()}: {pxr_words(error)}")
+        self._meshes()
         self.faults = list(dict.fromkeys(self.faults))
 
     # the stage
@@ -234,14 +256,26 @@ class Reader:
         band = attempt(faults, lambda: band_of(where, said))
         body = attempt(faults, lambda: self._trained(prim, where, band))
         override = attempt(faults, lambda: self.materials.said(prim))
-        pose = attempt(faults, lambda: self.places.uniform(prim, 1.0 / asset_metre(prim)))
-        if faults or body is None or pose is None:
+        placement = attempt(faults, lambda: self.places.placement(prim))
+        if faults or body is None or placement is None:
             raise SceneError(faults)
         if override is not None:
             shape, surface = body.shape, self.materials.surface(prim, *override)
             key = ("covered", id(shape), id(surface))
             body = self.kept.of(key, lambda: Body(shape, surface))
+        body, pose = self._scaled(where, body, placement, 1.0 / asset_metre(prim))
         self._stand(prim, body.to(self.device), pose, asset_file(prim))
+
+    def _scaled(
+        self, where: str, body: Body, placement: Placement, factor: float
+    ) -> tuple[Body, Pose]:
+        """What a scale makes of a learned object: an uneven one stretches its shape."""
+        if placement.even:
+            return body, placement.pose(placement.uniform() * factor)
+        scales = placement.scales * factor
+        self.stretched.append(f"{where} by {', '.join(f'{s:.4g}' for s in scales)}")
+        key = ("stretched", id(body), scales.tobytes())
+        return self.kept.of(key, lambda: stretched(body, scales)), placement.pose()
 
     def _trained(self, prim: Usd.Prim, where: str, band: tuple[float, float] | None) -> Body:
         """The body of a prim's weights, read once for all prims with the same file and hash."""
@@ -262,7 +296,8 @@ class Reader:
         thin = prim.IsA(UsdGeom.Curves) or prim.IsA(UsdGeom.Points)
         said = None if thin else self.materials.said(prim)
         if said is None:
-            self.decor.append(str(prim.GetPath()))
+            if not prim.GetCustomDataByKey(RESULTS):
+                self.decor.append(str(prim.GetPath()))
             return
         kind = str(prim.GetTypeName())
         if kind == "Mesh":
@@ -306,11 +341,28 @@ class Reader:
     def _mesh(self, prim: Usd.Prim, where: str, material: Material) -> None:
         placement = self.places.placement(prim)
         surface = self.materials.surface(prim, where, material)
-        shape = read_mesh(prim, self.time, placement.scales, _shared(prim), self.kept)
-        body = self.kept.of(("meshed", id(shape), id(surface)), lambda: Body(shape, surface))
-        if smoothed(prim) and not any(node.body is body for node in self.nodes):
+        mesh = read_mesh(prim, self.time, placement.scales, _shared(prim))
+        if smoothed(prim) and not any(mesh.key == m.read.key for m in self.meshes):
             self.cages.append(str(prim.GetPath()))
-        self._stand(prim, body.to(self.device), placement.pose(), None)
+        self.meshes.append(Waiting(len(self.nodes), prim, mesh, surface, placement.pose()))
+
+    def _meshes(self) -> None:
+        """Meshes stand once all are found, for their shapes are made together; in the order of prims."""
+        walked, waiting, self.meshes = self.nodes, self.meshes, []
+        made, self.nodes, done = shapes_of([m.read for m in waiting], self.kept), [], 0
+        for mesh in waiting:
+            self.nodes += walked[done : mesh.before]
+            done = mesh.before
+            shape, surface = made[mesh.read.key], mesh.surface
+            if isinstance(shape, SceneError):
+                self.faults += [f for f in shape.faults if f not in self.faults]
+                continue
+            key = ("meshed", id(shape), id(surface))
+            body = self.kept.of(key, partial(Body, shape, surface))
+            if body.shape.vertices.device != self.device:
+                body.to(self.device)
+            self._stand(mesh.prim, body, mesh.pose, None)
+        self.nodes += walked[done:]
 
     def _stand(self, prim: Usd.Prim, body: Body, pose: Pose, asset: str | None) -> None:
         pose = Pose(*(t.to(self.device) for t in (pose.rotation, pose.translation, pose.scale)))

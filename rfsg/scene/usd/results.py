@@ -19,13 +19,13 @@ from rfsg.scene.scene import Scene, SceneError, at_or_below
 from rfsg.scene.usd.edits import save_edits
 from rfsg.scene.usd.faults import quiet
 from rfsg.scene.usd.placements import world_from_stage
+from rfsg.scene.usd.reading import RESULTS
 from rfsg.scene.usd.source import Source, opened
 from rfsg.scene.weights import refuse_overwrite, write_beside
 
 PATHS_PRIM, MAP_PRIM = "/RadioPaths", "/RadioMap"
 RANGE_DB = 45.0  # of the colours of paths, below the strongest
 WIDTH = 0.02  # of a curve [m]
-MARK = "rfsg:results"  # in customData: a prim that later results may take the place of
 
 
 def write_paths(
@@ -113,7 +113,7 @@ def _over(
         below = opened(source.given or source.path, source.options).stage
         _refuse_taken(scene, below, name)
         author(own, np.linalg.inv(world_from_stage(below, path, [])))
-        own.GetPrimAtPath(name).SetCustomDataByKey(MARK, True)
+        own.GetPrimAtPath(name).SetCustomDataByKey(RESULTS, True)
         del below
     save_edits(scene, path, overwrite)
     try:
@@ -132,7 +132,7 @@ def _refuse_taken(scene: Scene, below: Usd.Stage, name: str) -> None:
     """Earlier results may give way, nothing else."""
     prim = below.GetPrimAtPath(name)
     things = (*scene.nodes, *scene.transmitters, *scene.receivers)
-    if (prim and not prim.GetCustomDataByKey(MARK)) or any(
+    if (prim and not prim.GetCustomDataByKey(RESULTS)) or any(
         at_or_below(thing.path, name) for thing in things
     ):
         raise SceneError(

@@ -2,12 +2,14 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade
 
+from rfsg.objects.body import Body, unstretched
 from rfsg.objects.contract import Surface
 from rfsg.scene import files
 from rfsg.scene.fields import FREQUENCY, VELOCITY
@@ -58,6 +60,7 @@ class _Writer:
         self.stage = new_stage()
         self.placed: dict[str, np.ndarray] = {}  # world matrices of what stands in the stage
         self.materials: dict[int, UsdShade.Material] = {}  # by identity of the surface
+        self.plain: dict[tuple[int, int], Body] = {}  # by identity of the shape and the surface
         self.assets: dict[int | Path, Path] = {}  # by identity of the body, or by the original
         self.patterns: dict[int, Path] = {}  # by identity of the pattern
         self.records: dict[str, AssetRecord] = {}
@@ -84,9 +87,9 @@ class _Writer:
                 self._radio(role, radio)
 
     def _node(self, node: Node, instance: bool) -> None:
+        node, stretch = self._unstretched(node)
         shape, surface = node.body.shape, node.body.surface
         material = material_of(surface)
-        stretch = np.ones(3)
         if shape.kind in PRIM_TYPES and material is not None:
             prim = self._define(node.path, PRIM_TYPES[shape.kind])
             stretch = author_shape(prim, shape)
@@ -100,6 +103,13 @@ class _Writer:
                 self._bind(prim, surface, material)
         self._place(prim, node.pose, stretch)
         self._velocity(prim, node.velocity)
+
+    def _unstretched(self, node: Node) -> tuple[Node, np.ndarray]:
+        """A node with the object that its asset holds, and the stretch that its transform carries."""
+        body, scales = unstretched(node.body)
+        if body is not node.body:
+            body = self.plain.setdefault((id(body.shape), id(body.surface)), body)
+        return replace(node, body=body), as_numpy(scales)
 
     def _asset(self, node: Node, material: Material | None) -> tuple[Path, bool]:
         """(asset file to reference, whether it carries the node's surface)."""

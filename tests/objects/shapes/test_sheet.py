@@ -9,7 +9,8 @@ import torch
 from rfsg.objects.catalogue import shape_class
 from rfsg.objects.shapes.edges import edges_of
 from rfsg.objects.shapes.mesh import Mesh, extruded
-from rfsg.objects.shapes.sheet import HALF, Sheet, _wedges
+from rfsg.objects.shapes.sheet import HALF, Sheet
+from rfsg.objects.shapes.sheet_soup import wedges_of
 
 F64 = torch.float64
 SQUARE = ([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -184,7 +185,8 @@ def test_windings_do_not_matter():
 def test_every_side_looks_into_one_wedge_of_each_of_its_edges():
     shape = soup()
     one = shape.triangles[: shape._count].numpy()
-    _, _, pairs = _wedges(shape.vertices.detach().numpy(), one)
+    side = np.arange(2 * len(one)).reshape(2, -1)
+    _, _, pairs = wedges_of(shape.vertices.detach().numpy(), one, *side)
     assert np.bincount(pairs[:, 2:].ravel(), minlength=2 * len(one)).tolist() == [3] * 2 * len(one)
 
 
