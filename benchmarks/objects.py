@@ -37,7 +37,8 @@ from rfsg.tracer.records import Rays
 DOCS = ROOT / "docs" / "performance.md"
 SAID = """Written by `OMP_NUM_THREADS=1 python benchmarks/objects.py --write-docs`: a hall of 40 m with so many
 instances of one trained cabinet, a transmitter and ten receivers. Seconds of the processor but for
-*search*, which is by the wall; *move*: the boxes of a hall in which one cabinet has moved."""
+*search*, which is by the wall; *move*: the boxes of a hall in which one cabinet has moved. Medians of five
+turns through all halls; the ratio is each turn's own."""
 ASSET = Path(__file__).resolve().parents[1] / "assets" / "objects" / "cabinet" / "cabinet.usda"
 SIDE, HEIGHT, WALL = 40.0, 6.0, 0.2  # [m]
 RAYS = 100_000
@@ -68,38 +69,41 @@ def hall(count: int, body: Body, receivers: int = 10) -> Scene:
     return Scene(tuple(nodes), (Radio.at("/t", 1.3, 0.7, 5.0),), tuple(radios), 2.4e9)
 
 
-def seconds(work: Callable[[], object], runs: int) -> float:
-    """Median of the processor's seconds, after a run that is not counted."""
+def seconds(work: Callable[[], object]) -> float:
+    """The processor's, of one run."""
+    begin = time.process_time()
     work()
-    taken = []
-    for _ in range(runs):
-        begin = time.process_time()
-        work()
-        taken.append(time.process_time() - begin)
-    return statistics.median(taken)
+    return time.process_time() - begin
 
 
-def costs(scene: Scene, runs: int) -> list[float]:
-    """Seconds of each of COLUMNS."""
-    searches: list[float] = []
+class Hall:
+    """What is asked of a hall, one of COLUMNS after the other, as often as wanted."""
 
-    def run() -> None:
-        searches.append(rfsg.simulate(scene, quality="draft").seconds["search"])
+    def __init__(self, count: int, body: Body):
+        self.scene = hall(count, body)
+        self.proxies = Proxies(World(self.scene))
+        origin = self.scene.transmitters[0].position.expand(RAYS, 3).clone()
+        far = torch.full((RAYS,), torch.inf, dtype=torch.float64)
+        self.rays = Rays(origin, fibonacci(RAYS), far)
+        last = self.scene.nodes[-1]
+        shift = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
+        moved = replace(last, pose=replace(last.pose, translation=last.pose.translation + shift))
+        self.after = World(replace(self.scene, nodes=(*self.scene.nodes[:-1], moved)))
 
-    whole = seconds(run, runs)
-    origin = scene.transmitters[0].position.expand(RAYS, 3).clone()
-    far = torch.full((RAYS,), torch.inf, dtype=torch.float64)
-    rays, proxies = Rays(origin, fibonacci(RAYS), far), Proxies(World(scene))
-    last = scene.nodes[-1]
-    shift = torch.tensor([0.1, 0.0, 0.0], dtype=torch.float64)
-    moved = replace(last, pose=replace(last.pose, translation=last.pose.translation + shift))
-    after = replace(scene, nodes=(*scene.nodes[:-1], moved))
-    return [
-        whole,
-        statistics.median(searches[1:]),
-        seconds(lambda: proxies.spans(rays), runs),
-        seconds(lambda: Proxies(World(after)), runs),
-    ]
+    def costs(self) -> list[float]:
+        """Seconds of each of COLUMNS."""
+        searches: list[float] = []
+
+        def run() -> None:
+            searches.append(rfsg.simulate(self.scene, quality="draft").seconds["search"])
+
+        whole = seconds(run)
+        return [
+            whole,
+            searches[-1],
+            seconds(lambda: self.proxies.spans(self.rays)),
+            seconds(lambda: Proxies(self.after)),
+        ]
 
 
 def resident() -> int:
@@ -120,20 +124,33 @@ def bytes_by_instance(few: int, many: int, body: Body) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--counts", type=int, nargs="+", default=[10, 32, 100, 316, 1000])
-    parser.add_argument("--runs", type=int, default=3)
+    parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--write-docs", action="store_true", help=f"a section of {DOCS.name}")
     args = parser.parse_args()
     begin, body = time.perf_counter(), load_asset(ASSET).body
     counts = sorted(args.counts)
     memory = bytes_by_instance(counts[0], counts[-1], body)
-    rows = {n: costs(hall(n, body), args.runs) for n in counts}
+    halls = {n: Hall(n, body) for n in counts}
+    for one in halls.values():
+        one.costs()  # the first time is not counted
+    turns = [{n: one.costs() for n, one in halls.items()} for _ in range(args.runs)]
+    rows = {
+        n: [statistics.median(c) for c in zip(*(t[n] for t in turns), strict=True)] for n in counts
+    }
     lines = [f"| instances | {' | '.join(f'{c} [s]' for c in COLUMNS)} |"]
     lines += ["|---" * (len(COLUMNS) + 1) + "|"]
     lines += [f"| {n} | {' | '.join(f'{v:.3f}' for v in row)} |" for n, row in rows.items()]
     decades = math.log10(counts[-1] / counts[0])
-    ends = zip(rows[counts[0]], rows[counts[-1]], strict=True)
-    ratios = [(b / a) ** (1.0 / decades) if decades else 1.0 for a, b in ends]
-    lines += [f"| ratio per decade | {' | '.join(f'{r:.1f}x' for r in ratios)} |", ""]
+    grown = [  # by turn, each column's growth from the fewest to the most
+        [(z / a) ** (1.0 / decades) for a, z in zip(t[counts[0]], t[counts[-1]], strict=True)]
+        for t in turns
+        if decades
+    ]
+    told = [
+        f"{statistics.median(c):.1f}x ({min(c):.1f} to {max(c):.1f})"
+        for c in zip(*grown, strict=True)
+    ]
+    lines += [f"| ratio per decade | {' | '.join(told)} |", ""]
     lines += [f"Memory: {memory / 1000:.1f} kB by instance.", ""]
     lines += [measured_on(time.perf_counter() - begin)]
     print(*lines, sep="\n")

@@ -11,8 +11,9 @@ from rfsg.scene.scene import Node, Scene
 from rfsg.scene.world import World
 from rfsg.tracer.embree import Proxies
 from rfsg.tracer.launch import fibonacci
-from rfsg.tracer.march import EVALUATE, SEARCH, crossings
+from rfsg.tracer.march import EVALUATE, SEARCH, crossings, far_in_float32, march, plain_march
 from rfsg.tracer.records import Rays
+from tests import shipped
 from tests.scenes import vector
 from tests.tracer.shapes import Field, ball, two_walls
 
@@ -47,6 +48,28 @@ def test_marched_ball_is_the_ball(options):
     torch.testing.assert_close(
         marched.normal_enter[deep], closed.normal_enter[both][deep], atol=1e-3, rtol=0
     )
+
+
+@pytest.mark.parametrize("name", ["cabinet", "person"])
+def test_far_steps_in_float32_find_what_all_in_float64_do(name):
+    """Plain twin: every step of the march by the network in float64."""
+    learned = shipped.shape(name)
+    low, high = learned.bounds().detach()
+    generator = torch.Generator().manual_seed(1)
+    drawn = torch.rand(2, 1500, 3, generator=generator, dtype=torch.float64)
+    start, end = (low - 0.2 + (high - low + 0.4) * d for d in drawn)
+    length = (end - start).norm(dim=-1)
+    asked = start, (end - start) / length[:, None], length
+    with torch.no_grad():
+        (row, *ends), (plain_row, *plain) = (
+            m(learned, *asked, EVALUATE) for m in (march, plain_march)
+        )
+    assert len(row) > 300 and torch.equal(row, plain_row)
+    torch.testing.assert_close(ends, plain, rtol=0, atol=1e-9)
+    near = 0.02 * torch.randn(500, 3, generator=generator, dtype=torch.float64) + start[:500]
+    mixed, value = far_in_float32(learned, near), learned.sdf(near)
+    assert torch.equal(mixed < 0, value < 0)
+    torch.testing.assert_close(mixed, value, rtol=1e-4, atol=0)
 
 
 def test_a_thing_met_twice_gives_two_stretches():
