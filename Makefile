@@ -16,8 +16,8 @@ demo: .venv/.installed
 	$(BIN)/rfsg map $(SCENE) --height 1.2 --cell 0.5 --quality draft --out $(OUT)/demo-map --overwrite
 	@echo; echo "Pictures:"; ls $(OUT)/demo/*.png $(OUT)/demo-moved/*.png $(OUT)/demo-map/*.png
 
-# one process a core, each with one thread: most tests are too small for two
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -rs --strict-skips -n auto --dist worksteal
+# one process a core, each with one thread: most tests are too small for two; what is compiled is kept
+PYTEST := OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -rs --strict-skips -n auto --dist worksteal
 
 test: lint
 	$(PYTEST)
