@@ -32,6 +32,15 @@ def _two_networks(scene: Scene) -> Scene:
     return replace(scene, nodes=tuple(n for n in scene.nodes if n.path not in furniture))
 
 
+def _whole(scene: Scene) -> Scene:
+    return scene
+
+
+FURNISHED = pytest.mark.parametrize(
+    "furnished", [_two_networks, pytest.param(_whole, marks=pytest.mark.slow)]
+)
+
+
 @pytest.fixture(scope="module")
 def result():
     return simulate(_lab(lab()), quality=QUALITY)
@@ -52,9 +61,10 @@ def test_reciprocity_with_polarised_antennas_and_edges(result):
     assert _apart(result.transfer(), back.transfer().transpose(0, 1)) < 1e-6
 
 
-def test_float64_networks_are_reciprocal_to_1e_9():
+@FURNISHED
+def test_float64_networks_are_reciprocal_to_1e_9(furnished):
     """The same with the networks' weights, and all that they compute, in float64."""
-    scene = _two_networks(_lab(Scene.from_usd(LAB)))
+    scene = furnished(_lab(Scene.from_usd(LAB)))
     for body in {id(n.body): n.body for n in scene.nodes}.values():
         body.double()
     swapped = replace(scene, transmitters=scene.receivers, receivers=scene.transmitters)
@@ -92,9 +102,10 @@ def test_order_of_objects_and_number_of_receivers_change_nothing(result):
     assert _apart(result.transfer()[:, 1], alone.transfer()[:, 0]) < 1e-9
 
 
-def test_saved_and_loaded_it_is_the_same_scene(result, tmp_path):
+@FURNISHED
+def test_saved_and_loaded_it_is_the_same_scene(result, tmp_path, furnished):
     """Written and read back, antennas too: the same h. The writer may reference the trained assets."""
-    scene = _two_networks(result.scene)
+    scene = furnished(result.scene)
     path = scene.to_usd(tmp_path / "lab.usda")
     again = Scene.from_usd(path, asset_roots=[ASSETS])
     assert [r.polarization for r in again.receivers] == ["V", "H", "+45"]
@@ -134,14 +145,15 @@ def test_without_polarised_radios_scalars_carry_the_same_power_in_free_space():
     torch.testing.assert_close(full.path_gain(), scalar.path_gain(), rtol=1e-12, atol=0)
 
 
-def test_path_gain_differentiates_in_pose_and_places(result):
+@FURNISHED
+def test_path_gain_differentiates_in_pose_and_places(result, furnished):
     """A person on a path and the receiver, moved: autograd against central differences on kept chains,
     along a random way of each.
 
     But for mirrors on learned faces: their zone is held while they are differentiated, which is not what
     a difference sees (docs/design.md).
     """
-    scene = _two_networks(result.scene.with_receivers([result.scene.receivers[0]]))
+    scene = furnished(result.scene.with_receivers([result.scene.receivers[0]]))
     index = scene.index("/World/Person")
     quality = replace(QUALITY, depth=1)
     chains = simulate(scene, quality=quality).chains
