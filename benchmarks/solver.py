@@ -80,26 +80,27 @@ def exhaustive(name: str) -> int:
 
 def rfsg_side(case: cases.Case, gradient: bool):
     """(answer, paths): a call that traces the case anew, and how many paths it returned."""
-    import rfsg_side as side
+    from rfsg import Body, simulate  # as a script begins: what these load is loaded by rfsg
+
+    import rfsg_side as side  # isort: skip
     import torch
 
     import rfsg
-    from rfsg.objects.body import Body
     from rfsg.objects.surfaces.slab import Slab
 
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     scene = side.build(case)
     quality = rfsg.Quality(depth=case.depth, floor_db=case.floor_db)
     if not gradient:
-        return lambda: len(rfsg.simulate(scene, quality=quality).paths.tx)
+        return lambda: len(simulate(scene, quality=quality).paths.tx)
     wall, *others = scene.nodes
     surface = Slab(0.1, eps_r=5.24, sigma=0.1)
     scene = replace(scene, nodes=(replace(wall, body=Body(wall.body.shape, surface)), *others))
     eps_r = surface.medium.eps_r.requires_grad_(True)
-    kept = rfsg.simulate(scene, quality=quality).chains
+    kept = simulate(scene, quality=quality).chains
 
     def answer() -> int:
-        result = rfsg.simulate(scene, quality=quality, gradients=True, chains=kept)
+        result = simulate(scene, quality=quality, gradients=True, chains=kept)
         result.path_gain().sum().backward()
         assert eps_r.grad is not None
         return len(result.paths.tx)
