@@ -8,7 +8,7 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check install --quiet -c co
 SCENE  := assets/scenes/lab.usda
 OUT    := out
 
-.PHONY: demo test test-all bench lint clean
+.PHONY: demo test test-all bench docs lint clean
 
 demo: .venv/.installed
 	$(BIN)/rfsg simulate $(SCENE) --out $(OUT)/demo --overwrite
@@ -39,6 +39,13 @@ bench: .venv/.installed-dev
 	$(BIN)/python benchmarks/widths.py --write-docs
 	$(BIN)/python benchmarks/tradeoffs.py --write-docs
 	$(BIN)/python benchmarks/goals.py --write-docs
+
+# pages as HTML; first the viewer's picture is taken anew in a real browser
+docs: .venv/.installed-dev
+	$(PIP) -e '.[docs]'
+	$(BIN)/python benchmarks/viewer_picture.py
+	$(BIN)/sphinx-build -q -b html docs $(OUT)/docs
+	@echo $(OUT)/docs/index.html
 
 lint: .venv/.installed-dev
 	$(BIN)/ruff check .

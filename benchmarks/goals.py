@@ -162,7 +162,8 @@ def paths() -> Iterator[Goal]:
             "faster, nothing lost",
             "; ".join(told),
             faster and found == there_are,
-            "Nine tenths of a process's start are the import of torch.",
+            "Four fifths of a process's start are the import of torch, which Sionna RT does without; the two "
+            "take turns in being first from run to run.",
         )
     ours, theirs = (
         table.cell("steady [s]", "gradient, 100 Rx, depth 3", side) for side in ("rfsg", "sionna")
@@ -188,17 +189,20 @@ def paths() -> Iterator[Goal]:
 def maps() -> Iterator[Goal]:
     """The radio map of the canyon."""
     table = next(tables(PAGE, "\n## A radio map of a street\n"))
-    ours = table.cell("then [s]", "rfsg, images")
-    theirs = table.cell("then [s]", "Sionna RT, 1,000,000 rays")
-    told = [f"{ours} s, exact, against {theirs} s"]
-    error = "95 % within [dB]"
-    told.append(f"{table.cell(error, 'Sionna RT, 1,000,000 rays').median:g} dB off at 95 % there")
+    error, theirs = "95 % within [dB]", "Sionna RT, 1,000,000 rays"
+    told, best = [], None
+    for way in ("rfsg, images", "rfsg, images, 2 reflections", theirs):
+        took, off = table.cell("then [s]", way), table.cell(error, way).median
+        told.append(f"{way}: {took} s, {off:.2g} dB at 95 %")
+        if way != theirs and off <= table.cell(error, theirs).median:
+            best = took.median if best is None else min(best, took.median)
     yield Goal(
         "radio map of the canyon, against Sionna RT at a million rays",
         "faster at the same error",
         "; ".join(told),
-        ours.median <= theirs.median,
-        "At its error no way of ours is as quick; at any smaller one ours is.",
+        best is not None and best <= table.cell("then [s]", theirs).median,
+        "A third of the exact map's time are gains, a third whether a line is free. Ten million rays, "
+        "which are no better at 95 %, take Sionna RT several times as long.",
     )
 
 
@@ -214,7 +218,11 @@ def objects() -> Iterator[Goal]:
         "less than 3 x a decade, less than 10 kB each",
         f"{growth:.1f} x; {each} kB",
         growth < 3 and each.median < 10,
-        "Each instance asks for mirror points of its own; most lead to no path.",
+        "Each instance asks for mirror points of its own, and 3 of the 184 paths at 1000 touch one: of 70,000 "
+        "candidates 16,000 pass a glance, 10,000 the first look at facets measured beforehand, 440 the first "
+        "measurement of a zone, which is a third of the time. Tried: bounds first, steps in closed form, "
+        "far steps in float32 (3.6 x before), finer clusters, float32 scores, no gain. Left: a proof that "
+        "a zone has no mirror point near the object.",
     )
 
 
