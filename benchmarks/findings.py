@@ -222,7 +222,7 @@ def plain_mesh(m: Measured) -> Told:
     rows = m.learned()["rows"]
     network, mesh = rows["shipped"], rows["mesh"]
     return Told(
-        f"The cabinet as its own mesh: {factor(mesh['seconds'] / network['seconds'])} the time of the lab with "
+        f"The cabinet as its own mesh: {factor(mesh['seconds'] / network['seconds'])} the time of a scene with "
         f"the network, and {db(network['from_mesh']['moved_db'])} apart where the cabinet matters.",
         mesh["seconds"] < network["seconds"],
     )
