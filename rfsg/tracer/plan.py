@@ -14,17 +14,17 @@ class Quality:
     asks for itself. What each costs and buys is from docs/tradeoff.md: one field at a time, errors
     of path gain at 90 % of links, on its street of 20 links where nothing else is said.
 
-    depth: most reflections on a path. Cheap among planes: 5 for 3 costs 1.1 to 2.3 times the time and
-        brings 0.7 dB to 0.4; in tetam_lab, 47 boxes, 2.7 times and 6 dB.
+    depth: most reflections on a path. Cheap among planes: 5 for 3 costs 1.1 times the time and brings
+        0.7 dB to 0.4; in tetam_lab, 47 boxes, 5 times and 6 dB.
     curved: most of them on curved or learned faces (each scatters a wave widely; two are weak). In the
-        lab, five learned objects at 2.44 GHz, 0 is 4 times quicker than 1 and moves 0.07 dB, 2 moves
-        0.06 dB. From 2 on the search is by rays: in a room of planes 38 times slower for nothing.
+        lab, five learned objects at 2.44 GHz, 0 takes 0.4 times the time of 1 and moves 0.17 dB; 2 takes
+        2.5 times and moves 0.13 dB, for from 2 on the search is by rays where anything is curved.
     curved_depth: most reflections in all on a path that has a curved or learned face: in the lab 3 in
-        place of 1 takes 3 times as long and moves 0.2 dB.
-    diffraction: most edges that a path bends round: 0, 1 or 2. The dearest field: 1 costs 9 times
-        the time of 0 and buys 3 dB (12 in tetam_lab); 2 another 50 times, and 0.6 dB.
+        place of 1 takes 4 times as long and moves 0.4 dB.
+    diffraction: most edges that a path bends round: 0, 1 or 2. The dearest field: 1 costs 7 times
+        the time of 0 and buys 3 dB (12 in tetam_lab); 2 another 37 times, and 0.6 dB.
     diffraction_depth: most interactions in all on a path that bends round one edge: 1 in place of 2
-        halves the time and costs 0.5 dB.
+        takes a third of the time and costs 0.5 dB.
     diffuse: tiles per face and direction, at least, from which rough surfaces scatter (0: none).
     phase_seed: which draw of the tiles' random phases. refraction: solids bend what goes through them.
     search: "auto" enumerates all sequences of faces where the scene is small enough (nothing can be
@@ -32,9 +32,9 @@ class Quality:
     rays: directions launched from each transmitter at most, or from each receiver where these are
         fewer (Fibonacci lattice), by "rays" only. They go out in rounds, an eighth, an eighth, a quarter,
         a half; one that finds no new chain is the last. What each found, and how much more may be
-        missing, stands in the report. 2,000 lose 3 of 936 paths, 20,000 none; time grows with them.
+        missing, stands in the report. 2,000 lose 2 of 936 paths, 20,000 none; time grows with them.
     floor_db: paths weaker than this below free space at the same length are not followed [dB]. -50
-        keeps two thirds of the paths of -80 and is no quicker, within 0.2 dB. Sequences of faces are
+        keeps two thirds of the paths of -80, is hardly quicker, and within 0.2 dB. Sequences of faces are
         given up where the largest reflection of each, at the angles it may be met at, proves it.
     epsilon: search tolerance of a march on learned shapes [m] (the paper's 0.01 m); hits are polished.
         From 0.001 to 0.05 it moves nothing in the lab, by rays; the least is half as slow again.
@@ -44,9 +44,9 @@ class Quality:
         "newton", "mesh" or "grid" (``tracer.intersect``).
     integral: "telescoped" in occupancy, or "riemann", the paper's left sum: 0.001 dB apart in the lab.
     zone_rings: rings of sample points in a Fresnel zone where a learned surface is measured. In the lab
-        1 halves the time and moves a link by 2.5 dB; 4 in place of 2 moves 0.2 dB.
+        1 is hardly quicker and moves a link by 3.6 dB; 4 in place of 2 moves 0.2 dB.
     refits: most rounds of zone measurement and Newton steps on a path with learned surfaces. In the lab
-        8 find what 10 find, 4 lose 5 of 128 paths and 0.1 dB.
+        4 find what 10 find.
     newton: most Newton steps per round.
     map_rays: directions from each transmitter for power estimates and radio maps.
     chunk: most rays or points at a time (bounds memory).
