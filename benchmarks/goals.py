@@ -193,7 +193,8 @@ def maps() -> Iterator[Goal]:
     told, best = [], None
     for way in ("rfsg, images", "rfsg, images, 2 reflections", theirs):
         took, off = table.cell("then [s]", way), table.cell(error, way).median
-        told.append(f"{way}: {took} s, {off:.2g} dB at 95 %")
+        wrong = table.text("wrongly lit or dark", way)
+        told.append(f"{way}: {took} s, {off:.2g} dB at 95 %, {wrong} cells wrongly lit or dark")
         if way != theirs and off <= table.cell(error, theirs).median:
             best = took.median if best is None else min(best, took.median)
     yield Goal(
