@@ -27,16 +27,16 @@ class Placement:
     translation: Float64[ndarray, "3"]
     scales: Float64[ndarray, "3"]
 
-    @property
-    def even(self) -> bool:
-        """Whether all axes are scaled alike."""
-        return bool(np.ptp(self.scales) <= TOLERANCE * self.scales.max())
+    def even(self, *axes: int) -> bool:
+        """Whether the given axes (all by default) are scaled alike."""
+        scales = self.scales[list(axes)] if axes else self.scales
+        return bool(np.ptp(scales) <= TOLERANCE * scales.max())
 
     def uniform(self, *axes: int) -> float:
         """The common scale of the given axes (all by default); ValueError if they differ."""
-        scales = self.scales[list(axes)] if axes else self.scales
-        if np.ptp(scales) > TOLERANCE * scales.max():
+        if not self.even(*axes):
             raise ValueError(f"scaled differently along its axes ({_digits(self.scales)})")
+        scales = self.scales[list(axes)] if axes else self.scales
         return float(scales[0] if np.ptp(scales) == 0 else scales.mean())
 
     def pose(self, scale: float = 1.0) -> Pose:

@@ -39,7 +39,7 @@ def soups(meshes: Sequence[tuple[ndarray, ndarray]]) -> list[Soup | ValueError]:
     good: dict[int, tuple[ndarray, ndarray]] = {}
     for k, (vertices, triangles) in enumerate(meshes):
         try:
-            good[k] = _checked(np.asarray(vertices), np.asarray(triangles))
+            good[k] = topology.checked(vertices, triangles, 1, "divide a larger sheet into pieces")
         except ValueError as error:
             out[k] = error
     together = _together(list(good.values())) if good else []
@@ -99,22 +99,6 @@ def _apart(whole: Soup, v: ndarray, s: ndarray, w: ndarray, t: ndarray) -> list[
 def _ends(owner: Int[ndarray, "n"], count: int) -> Int[ndarray, "c1"]:
     """Where the rows of each owner begin, and where the last end; rows stand in the order of owners."""
     return np.searchsorted(owner, np.arange(count + 1))
-
-
-def _checked(vertices: ndarray, triangles: ndarray) -> tuple[ndarray, ndarray]:
-    """The arrays as float64 and int64. Raises ValueError for what they cannot be."""
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-        raise ValueError(f"vertices of shape {vertices.shape}: expected finite rows x, y, z [m]")
-    most = topology.MAX_TRIANGLES
-    whole = triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype.kind in "iu"
-    if not whole or not 1 <= len(triangles) <= most:
-        raise ValueError(
-            f"triangles of shape {triangles.shape}: expected 1 to {most} rows of three vertex "
-            "numbers; divide a larger sheet into pieces"
-        )
-    if triangles.min() < 0 or triangles.max() >= len(vertices):
-        raise ValueError(f"triangles name vertices outside of 0 to {len(vertices) - 1}")
-    return vertices.astype(np.float64), triangles.astype(np.int64)
 
 
 def _cleaned(

@@ -33,7 +33,8 @@ def closed_mesh(vertices: ndarray, triangles: ndarray) -> Topology:
     Raises ValueError for a mesh of other arrays, with numbers that are not finite or indices out of
     range, with triangles without area, or that does not close.
     """
-    vertices, triangles = _checked(vertices, triangles)
+    finer = "learn a finer mesh as a neural shape (`rfsg learn-shape`)"
+    vertices, triangles = checked(vertices, triangles, 4, finer)
     place, index = np.unique(vertices, axis=0, return_inverse=True)
     corner = index.reshape(-1)[triangles]
     # a triangle with two corners at one place is a line: its neighbours meet there
@@ -56,15 +57,18 @@ def closed_mesh(vertices: ndarray, triangles: ndarray) -> Topology:
     )
 
 
-def _checked(vertices: ndarray, triangles: ndarray) -> tuple[ndarray, ndarray]:
+def checked(
+    vertices: ndarray, triangles: ndarray, fewest: int, advice: str
+) -> tuple[ndarray, ndarray]:
+    """The arrays as float64 and int64. Raises ValueError for what they cannot be."""
     vertices, triangles = np.asarray(vertices, np.float64), np.asarray(triangles)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
         raise ValueError(f"vertices of shape {vertices.shape}: expected finite rows x, y, z [m]")
     whole = triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype.kind in "iu"
-    if not whole or not 4 <= len(triangles) <= MAX_TRIANGLES:
+    if not whole or not fewest <= len(triangles) <= MAX_TRIANGLES:
         raise ValueError(
-            f"triangles of shape {triangles.shape}: expected 4 to {MAX_TRIANGLES} rows of three "
-            "vertex numbers; learn a finer mesh as a neural shape (`rfsg learn-shape`)"
+            f"triangles of shape {triangles.shape}: expected {fewest} to {MAX_TRIANGLES} rows of three "
+            f"vertex numbers; {advice}"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise ValueError(f"triangles name vertices outside of 0 to {len(vertices) - 1}")

@@ -63,7 +63,8 @@ def shapes_of(meshes: Sequence[MeshRead], kept: Kept) -> dict[str, Mesh | SceneE
     thousands, of a few triangles each."""
     made: dict[str, Mesh | SceneError] = {}
     sheets: dict[str, tuple[ndarray, ndarray]] = {}
-    for mesh in {m.key: m for m in meshes}.values():
+    each = {mesh.key: mesh for mesh in meshes}
+    for mesh in each.values():
         try:
             if mesh.sheet and not kept.holds(mesh.key):
                 sheets[mesh.key] = mesh.arrays()
@@ -71,10 +72,9 @@ def shapes_of(meshes: Sequence[MeshRead], kept: Kept) -> dict[str, Mesh | SceneE
                 made[mesh.key] = kept.of(mesh.key, partial(_solid, mesh))
         except ValueError as error:
             made[mesh.key] = _no_solid(mesh, error)
-    where = {mesh.key: mesh for mesh in meshes}
     for key, soup in zip(sheets, soups(list(sheets.values())), strict=True):
         if isinstance(soup, ValueError):
-            made[key] = _no_solid(where[key], soup)
+            made[key] = _no_solid(each[key], soup)
         else:
             made[key] = kept.of(key, partial(Sheet.of, soup))
     return made

@@ -270,7 +270,7 @@ class Reader:
         self, where: str, body: Body, placement: Placement, factor: float
     ) -> tuple[Body, Pose]:
         """What a scale makes of a learned object: an uneven one stretches its shape."""
-        if placement.even:
+        if placement.even():
             return body, placement.pose(placement.uniform() * factor)
         scales = placement.scales * factor
         self.stretched.append(f"{where} by {', '.join(f'{s:.4g}' for s in scales)}")
